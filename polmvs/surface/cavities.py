@@ -25,17 +25,16 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
 
 from polmvs.camera import in_frame, sample_image
 from polmvs.fitting import robust_deviation
-from polmvs.geometry import dots, unit_or_zero
 from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS
 from polmvs.surface.borders import cells_beside
 from polmvs.surface.creases import CreaseTolerances
-from polmvs.surface.mesh_geometry import MAX_CELLS, RayScene
+from polmvs.surface.mesh_geometry import MAX_CELLS, RayScene, TriangleMesh, height_field
 from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
     MAX_COST,
@@ -63,6 +62,11 @@ Mask = NDArray[np.bool_]
 SAME_PLANE_PX = HullTolerances.step_px  # GSDs, uncertainty of a rim's plane: a cell of the hull
 MIN_BORDER = 10  # least number of faces of a rim, and of the border of an opening
 THICKNESS_RATIO = 1.25  # of neighbours among the thicknesses that are tried
+NUM_SECTORS = 8  # around an opening
+RIM_CELLS = 8  # across a rounded rim, whose normals turn by 180 deg
+RIM_RATIO = THICKNESS_RATIO ** (1 / 3)  # as 1.25, between thicknesses of a rounded rim: its phases
+# contradict one that is a tenth off
+MIN_CAP = 0.5  # of an opening's area, without support of the phases. Guess
 TOP_SECTORS = 36  # in each of which the top of a wall is sought
 PLANE_ROUNDS = 3  # of the fit of a plane to half of a border
 
@@ -113,6 +117,7 @@ class Cavity:
         positive in the cavity.
     layer_step : distance of the layers, world units.
     first_layer : depth of the first layer below the rim, in layers (negative: above).
+    is_measured : whether the phases on its walls gave the thickness, not those of the rim.
     """
 
     rim: Patch
@@ -122,6 +127,7 @@ class Cavity:
     field: Image
     layer_step: float
     first_layer: int
+    is_measured: bool = False
 
     @property
     def is_deep(self) -> bool:
@@ -145,6 +151,8 @@ class Cavity:
 
 # Information (V,) that a cavity adds to each view's phases, nats.
 Gain: TypeAlias = Callable[[Cavity], Array]
+# Information (V, F) of each view's phases on the faces of a mesh, nats.
+Information: TypeAlias = Callable[[TriangleMesh], sparse.csr_array]
 
 
 @dataclass(frozen=True)
@@ -218,6 +226,7 @@ def find_cavities(
     surface: SurfaceFaces,
     scene: PatchScene,
     gain: Gain,
+    information: Information,
 ) -> tuple[Cavity, ...]:
     """Openings that a surface closes with a cap, and the cavities behind them.
 
@@ -226,6 +235,7 @@ def find_cavities(
     surface : refined; its outside determines the cavity's walls.
     scene : the views.
     gain : information (V,) of each view's phases that a cavity adds to the closed surface's.
+    information : (V, F) of each view's phases on the faces of a mesh.
     """
     if len(scene.maps) < MIN_VIEWS:
         return ()
@@ -234,10 +244,11 @@ def find_cavities(
         plane = _plane_of(opening, surface)
         if plane is None:
             continue
-        rim = _rim(surface, opening, plane, scene)
-        if any(_is_same(rim or plane, other.rim, surface) for other in found):
+        if any(_is_same(plane, other.rim, surface) for other in found):
             continue
-        cavity = None if rim is None else _dark_cavity(surface, opening, rim, scene)
+        cavity = _rounded_cavity(surface, opening, plane, information)
+        if cavity is None:
+            cavity = _dark_cavity(surface, opening, plane, scene)
         if cavity is None:
             cavity = _bright_cavity(surface, opening, plane, gain)
         if cavity is not None:
@@ -289,14 +300,32 @@ def _least_area(gsd: float) -> float:
     return float(np.pi * (2 * TOL.rounding * gsd) ** 2)
 
 
-def _dark_cavity(
-    surface: SurfaceFaces, opening: Opening, rim: Patch, scene: PatchScene
+def _is_enclosed(surface: SurfaceFaces, opening: Opening, plane: Patch) -> bool:
+    """Whether supported faces surround an opening that is wide enough for a wall."""
+    if opening.area < _least_area(surface.gsd):
+        return False
+    return _surrounds(plane, surface.centers[opening.border], surface.centers[opening.patch])
+
+
+def _rounded_cavity(
+    surface: SurfaceFaces, opening: Opening, plane: Patch, information: Information
 ) -> Cavity | None:
-    """The cavity with a wall as thick as the rim about its dark opening."""
+    """The cavity within a rounded rim."""
+    if not _is_enclosed(surface, opening, plane):
+        return None
+    wall = _rounded_wall(surface, opening, plane, information)
+    return None if wall is None else _cavity(surface, wall, _grid_about(surface, wall.rim), opening)
+
+
+def _dark_cavity(
+    surface: SurfaceFaces, opening: Opening, plane: Patch, scene: PatchScene
+) -> Cavity | None:
+    """The cavity with a wall as thick as the flat rim about its dark opening."""
+    rim = _rim(surface, opening, plane, scene)
+    if rim is None:
+        return None
     grid = _grid_about(surface, rim)
-    wall = _rounded_wall(surface, rim, grid)
-    if wall is None:
-        wall = _flat_wall(surface, rim, grid, scene)
+    wall = _flat_wall(surface, rim, grid, scene)
     return None if wall is None else _cavity(surface, wall, grid, opening)
 
 
@@ -309,9 +338,7 @@ def _bright_cavity(
     contradicts fewer phases, so the thicker wall is taken. ``gain`` is the information that a
     cavity adds.
     """
-    if opening.area < _least_area(surface.gsd):
-        return None
-    if not _surrounds(plane, surface.centers[opening.border], surface.centers[opening.patch]):
+    if not _is_enclosed(surface, opening, plane):
         return None
     cavity_of = _cavities_within(surface, opening, _top_of_wall(surface, opening, plane))
     found = []
@@ -338,7 +365,8 @@ def _cavities_within(
         start = max(TOL.rounding, radius)
         outer = outside_at(start)
         wall = _Wall(rim, thickness, sigma, -outer - (radius or thickness), outer, start, radius)
-        return _cavity(surface, wall, grid, opening)
+        cavity = _cavity(surface, wall, grid, opening)
+        return None if cavity is None else replace(cavity, is_measured=True)
 
     return cavity_of
 
@@ -360,7 +388,7 @@ class _Thickness:
     @property
     def views_agree(self) -> bool:
         """Whether the mean of the views shows the wall at a significance of 95 %."""
-        return bool(self.gain.mean() > ONE_SIDED * _sigma_of_mean(self.gain))
+        return _agree(self.gain)
 
 
 def _likeliest_thickness(
@@ -385,15 +413,21 @@ def _likeliest_thickness(
             best += step
     if not total(best) > 0:
         return None
-    below, here, above = gains[best - 1], gains[best], gains[best + 1]
-    # The vertex of a parabola. Its deviation is that of the slope.
-    shift, sigma = 0.0, 1.0
-    if np.isfinite(below).all() and np.isfinite(above).all():
-        slope, bend = 0.5 * (above - below), (below - 2 * here + above).mean()
-        if bend < 0:
-            shift, sigma = -slope.mean() / bend, _sigma_of_mean(slope) / -bend
+    shift, sigma = _vertex(gains[best - 1], gains[best], gains[best + 1])
     thickness = thickness_of(best + shift)
-    return _Thickness(thickness, thickness * (THICKNESS_RATIO**sigma - 1), here)
+    return _Thickness(thickness, thickness * (THICKNESS_RATIO**sigma - 1), gains[best])
+
+
+def _vertex(below: Array, here: Array, above: Array) -> tuple[float, float]:
+    """Place of the greatest mean of values (V,) at -1, 0 and 1, by a parabola, and its deviation.
+
+    The deviation is that of the slope.
+    """
+    if np.isfinite(below).all() and np.isfinite(above).all():
+        slope, bend = 0.5 * (above - below), float((below - 2 * here + above).mean())
+        if bend < 0:
+            return -float(slope.mean()) / bend, _sigma_of_mean(slope) / -bend
+    return 0.0, 1.0
 
 
 def _top_of_wall(surface: SurfaceFaces, opening: Opening, plane: Patch) -> Patch:
@@ -421,6 +455,11 @@ def _top_of_wall(surface: SurfaceFaces, opening: Opening, plane: Patch) -> Patch
         normal = normal * np.sign(normal @ plane.normal)
         plane = replace(plane, normal=normal, offset=float(point @ normal))
     return plane
+
+
+def _agree(gain: Array) -> bool:
+    """Whether gains (N,) have a positive mean at a significance of 95 %."""
+    return bool(gain.mean() > ONE_SIDED * _sigma_of_mean(gain))
 
 
 def _sigma_of_mean(values: Array) -> float:
@@ -682,39 +721,97 @@ def _flat_wall(
     return _Wall(rim, thickness, sigma, -np.asarray(beside, np.float64), outer, TOL.rounding, 0.0)
 
 
-def _rounded_wall(surface: SurfaceFaces, rim: Patch, grid: PatchGrid) -> _Wall | None:
-    """The wall under a rim that is a half circle across: twice as thick as its radius r.
+def _rounded_wall(
+    surface: SurfaceFaces, opening: Opening, plane: Patch, information: Information
+) -> _Wall | None:
+    """The wall under a rim that is a half circle across, of the radius that is likeliest.
 
-    On such a rim the sine between vertical and normal, positive outwards, is 1 - d / r at the
-    distance d from the outside of the wall; on a flat one it is 0. None if that fits better.
+    The inner half of the rim faces the axis of the opening, which no cap does. So its phases also
+    show that there is an opening. None if they do not. ``plane`` is that of the opening's border.
     """
-    start = TOL.rounding
-    for _ in range(2):  # the outside is that of the wall only below the radius
-        outer = _outside_at(surface, rim, grid, start)
-        near = np.abs(rim.height(surface.centers)) < start * grid.step
-        near &= surface.supported & (surface.normals @ rim.normal > 0.5)
-        cells = grid.cells(surface.centers[near]).T
-        slopes = [ndimage.map_coordinates(part, cells, order=1) for part in np.gradient(outer)]
-        outwards = unit_or_zero(np.stack(slopes, axis=1))
-        sine = dots(surface.normals[near], outwards @ np.stack([grid.first, grid.second]))
-        distance = -ndimage.map_coordinates(outer, cells, order=1)
-        inner = sine < 0  # these determine the radius best
-        if inner.sum() < MIN_BORDER:
-            return None
-        radii = distance[inner] / (1 - sine[inner])
-        radius = float(np.median(radii))
-        start = max(TOL.rounding, radius)
-    misfit = np.abs(sine - (1 - distance / max(radius, 1e-300)))
-    if not np.median(misfit) < np.median(np.abs(sine)):
+    rim = _top_of_wall(surface, opening, plane)
+    grid = _grid_about(surface, rim)
+    tried = _walls_about(opening, -_outside_at(surface, rim, grid, TOL.rounding), surface.gsd)
+    middle = surface.centers[opening.patch].mean(axis=0)
+    of_rims = [_on_half_circle(surface, rim, middle, wall, information) for wall in tried]
+    if not of_rims:
         return None
-    middle = np.median(cells, axis=1)
-    sector = _sectors(*(cells[:, inner] - middle[:, None]))
-    around = np.array([np.median(radii[sector == number]) for number in np.unique(sector)])
-    sigma = 2 * robust_deviation(around - radius)
-    return _Wall(rim, 2 * radius, sigma, -outer - radius, outer, start, radius)
+    best = int(np.argmax([found.of_views.sum() for found in of_rims]))
+    sectors = np.array([found.inner_of_sectors for found in of_rims])
+    shown = of_rims[best]
+    if not all(map(_agree, (shown.of_views, shown.inner_of_views, sectors[best]))):
+        return None
+    thickness = tried[best]
+    if 0 < best < len(tried) - 1:
+        beside = [found.of_views for found in of_rims[best - 1 : best + 2]]
+        thickness = float(thickness * RIM_RATIO ** _vertex(*beside)[0])
+    sigma = robust_deviation(np.array(tried)[sectors.argmax(axis=0)] - thickness)
+    radius = 0.5 * thickness
+    start = max(TOL.rounding, radius)
+    outer = _outside_at(surface, rim, grid, start)
+    return _Wall(rim, thickness, sigma, -outer - radius, outer, start, radius)
 
 
-def _sectors(x: Floats, y: Floats, num: int = 8) -> Indices:
+def _walls_about(opening: Opening, inwards: Array, gsd: float) -> list[float]:
+    """Thicknesses of a wall, in GSD, that leave an opening which its cap fills.
+
+    ``inwards`` (H, W) are distances from the outside of the wall, in cells of one GSD.
+    """
+    tried: list[float] = []
+    thickness = TOL.rounding / THICKNESS_RATIO**2
+    while (open_cells := np.count_nonzero(inwards > thickness)) > np.pi * TOL.rounding**2:
+        if opening.area > MIN_CAP * open_cells * gsd**2:
+            tried.append(thickness)
+        thickness *= RIM_RATIO
+    return tried
+
+
+@dataclass(frozen=True)
+class _RimInformation:
+    """Information of the phases on a rounded rim, nats.
+
+    Attributes
+    ----------
+    of_views, inner_of_views : (V,) of each view, on the rim and on its inner half.
+    inner_of_sectors : (8,) of the inner half in each sector about the opening.
+    """
+
+    of_views: Array
+    inner_of_views: Array
+    inner_of_sectors: Array
+
+
+def _on_half_circle(
+    surface: SurfaceFaces, rim: Patch, middle: Array, thickness: float, information: Information
+) -> _RimInformation:
+    """Information on the half circle across a wall.
+
+    ``rim`` is the plane through its top, ``middle`` (3,) a point of the opening, ``thickness`` in
+    GSD.
+    """
+    radius = 0.5 * thickness
+    grid = _grid_about(surface, rim).at_step(thickness * surface.gsd / RIM_CELLS)
+    start = max(TOL.rounding, radius)  # only below it the outside is that of the wall
+    depth = start * surface.gsd / grid.step
+    outer = ndimage.gaussian_filter(_outside_at(surface, rim, grid, depth), 1.0, mode="nearest")
+    inwards = -outer * grid.step / surface.gsd
+    across = np.clip(inwards, 0, thickness)
+    height = np.sqrt(across * (thickness - across)) - radius
+    points = grid.points(rim) + height[..., None] * surface.gsd * rim.normal
+    mesh = height_field(points, (inwards >= 0) & (inwards <= thickness))
+    cells = grid.cells(mesh.centers)
+    inner = ndimage.map_coordinates(inwards, cells.T, order=1) > radius
+    sector = _sectors(*(cells - grid.cells(middle)).T)
+    found = information(mesh)
+    of_faces = np.asarray(found.sum(axis=0))
+    return _RimInformation(
+        np.asarray(found.sum(axis=1)),
+        np.asarray(found @ inner.astype(np.float64)),
+        np.bincount(sector[inner], of_faces[inner], NUM_SECTORS).astype(np.float64),
+    )
+
+
+def _sectors(x: Floats, y: Floats, num: int = NUM_SECTORS) -> Indices:
     """Which of a number of sectors about the origin (N,) points lie in."""
     return np.floor((np.arctan2(y, x) / np.pi + 1) * 0.5 * num).astype(np.int64) % num
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from polmvs.camera import sample_image
 from polmvs.geometry import lengths
@@ -80,6 +81,7 @@ from polmvs.surface.surface_quality import (
     loses_silhouettes,
     misfit,
     outline_mismatch,
+    pixel_information,
     point_offset,
     points_deny,
     stand_apart,
@@ -109,6 +111,7 @@ REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured 
 # Before edges are sharp, outlines pull the faces outwards by what rounding removes: 0.2 to 0.4 px.
 # Each polishing step halves this error. Measured on analytic boxes.
 SHARP_STEPS = 4
+RIM_WIDTH_PX = 0.35  # of the images' smoothing about rims of a few pixels; less gives the same
 DEVIATION_EDGE_PX = 6.0  # of the mesh on which the position uncertainty is computed
 MAX_PATCH_VIEWS = 24  # evenly chosen views that show planar patches: it bounds time and memory
 NUM_FINAL_STEPS = 3  # of the progress: evidence, normals, deviations
@@ -564,9 +567,14 @@ def _supported(
     own = sigma.own * np.sqrt(misfit(mesh, labelled))
     sigma = PositionSigma(own, np.hypot(sigma.shared, polished.bias_sigma))
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
-    inferred = seen & ~supported & _lie_on(mesh, [cavity.values for cavity in cavities])
+    contradicted = contradicted_faces(mesh, evidence, gsd=fit.gsd)
+    inferred = ~supported & _lie_on(mesh, [cavity.values for cavity in cavities])
+    # Light in a cavity that its rim shows was reflected several times: it denies any wall.
+    of_rim = [cavity.values for cavity in cavities if not cavity.is_measured]
+    inferred |= contradicted & _lie_on(mesh, of_rim)
+    inferred &= seen
     supported |= inferred
-    contradicted = contradicted_faces(mesh, evidence, gsd=fit.gsd) & ~inferred
+    contradicted &= ~inferred
     known = fit.known or KnownPoints(np.zeros((0, 3)), np.zeros(0))
     offset_px, offset_sigmas = point_offset(mesh, supported, sigma.total, known, fit.gsd)
     residual, _ = labelled.residuals(mesh)
@@ -641,7 +649,15 @@ def _cavities(given: _Given, refined: Refined, scene: RayScene) -> tuple[Cavity,
         step = min(HullTolerances.step_px * fit.gsd, 0.5 * cavity.thickness)
         return information(step, cavity.values) - closed(step)
 
-    return find_cavities(surface_faces(scene, seen, supported, fit.gsd), given.scene, gain)
+    @cache
+    def at_rims() -> Fit:
+        return fit.at_width(RIM_WIDTH_PX)
+
+    def of_faces(mesh: TriangleMesh) -> sparse.csr_array:
+        return pixel_information(mesh, at_rims())
+
+    surface = surface_faces(scene, seen, supported, fit.gsd)
+    return find_cavities(surface, given.scene, gain, of_faces)
 
 
 def _lie_on(mesh: TriangleMesh, carvings: Sequence[SignedDistance]) -> Mask:

@@ -160,6 +160,17 @@ class TriangleMesh:
         return np.asarray(np.einsum("nji,nj->ni", self.corners.take(face, axis=0), barycentric))
 
 
+def height_field(points: Array, kept: Mask) -> TriangleMesh:
+    """Triangles between the kept ``(H, W)`` of points ``(H, W, 3)`` over a grid.
+
+    They face where rows, columns and normal are right-handed.
+    """
+    index = np.arange(kept.size).reshape(kept.shape)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)
+    return TriangleMesh(points.reshape(-1, 3), faces).only(np.all(kept.ravel()[faces], axis=1))
+
+
 @dataclass(frozen=True)
 class RayHits:
     """Where rays first meet a mesh.

@@ -165,6 +165,11 @@ class PatchGrid:
     step: float
     shape: tuple[int, int]
 
+    def at_step(self, step: float) -> PatchGrid:
+        """The grid over the same area with cells of another side."""
+        rows, columns = (int(np.ceil(num * self.step / step)) for num in self.shape)
+        return replace(self, step=step, shape=(rows, columns))
+
     def cells(self, points: Floats) -> Array:
         """Row and column ``(..., 2)`` of points ``(..., 3)``, fractional."""
         local = np.asarray(points, np.float64) - self.origin

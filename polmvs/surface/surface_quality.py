@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
 
 from polmvs.camera import sample_image
 from polmvs.fitting import like_most, robust_deviation
@@ -222,18 +222,24 @@ def contradicted_faces(
     return _wide_parts(mesh, information < 0, gsd)
 
 
-def view_information(mesh: TriangleMesh, fit: Fit) -> Array:
-    """Information of the phases of each of V views, ``(V,)``: nats, summed over its pixels."""
+def pixel_information(mesh: TriangleMesh, fit: Fit) -> sparse.csr_array:
+    """Information of the phases of V views on each face, ``(V, F)``: nats, summed over pixels."""
     labelled = label(mesh, fit)
     seen = labelled.observations
     information = labelled.information(mesh, fit)
-    found = np.zeros(len(fit.views))
+    found = np.zeros(len(seen.face))
     for one in seen.of_views():
         face, number = seen.face[one], int(seen.view[one.start])
         gsd = fit.views[number].gsd(mesh.centers[face])
         pixels = mesh.face_areas[face] * seen.cosine[one] / gsd**2
-        found[number] = pixels @ information[one]
-    return found
+        found[one] = pixels * information[one]
+    shape = (len(fit.views), len(mesh.faces))
+    return sparse.coo_array((found, (seen.view, seen.face)), shape=shape).tocsr()
+
+
+def view_information(mesh: TriangleMesh, fit: Fit) -> Array:
+    """Information of the phases of each of V views, ``(V,)``: nats, summed over its pixels."""
+    return np.asarray(pixel_information(mesh, fit).sum(axis=1))
 
 
 def misfit(mesh: TriangleMesh, labelled: Labelled) -> Array:

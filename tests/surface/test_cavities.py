@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from polmvs.camera import PinholeCamera
 from polmvs.polarization.kinds import AngleModel, Light
@@ -18,8 +19,8 @@ from polmvs.surface.cavities import (
     find_cavities,
     surface_faces,
 )
-from polmvs.surface.mesh_geometry import RayScene, mesh_from_grid
-from polmvs.surface.offsets import patch_scene
+from polmvs.surface.mesh_geometry import RayScene, mesh_from_grid, visible_points
+from polmvs.surface.offsets import MAX_COST, patch_scene
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Cylinder, Group, Plane
 
@@ -179,7 +180,25 @@ def closed_rounded_vessel():
 def found_in(surface, maps, information=lambda cavity: np.zeros(8)):
     """Cavities of a surface; without ``information`` the phases in its openings say nothing."""
     scene = patch_scene(maps, AngleModel.PPA)
-    return find_cavities(surface, scene, lambda cavity: information(cavity) - information(None))
+
+    def of_faces(mesh):
+        pixels = np.zeros((len(maps), len(mesh.faces)))
+        for row, one in zip(pixels, maps, strict=True):
+            seen, _, cosine = visible_points(
+                RayScene(mesh),
+                one.view.center_in_world,
+                mesh.centers,
+                mesh.face_normals,
+                min_cosine=0.2,
+            )
+            row[seen] = mesh.face_areas[seen] * cosine / GSD**2
+        losses = scene.losses(mesh.centers, mesh.face_normals.T)
+        return sparse.csr_array(pixels * np.nan_to_num(MAX_COST - losses))
+
+    def gain(cavity):
+        return information(cavity) - information(None)
+
+    return find_cavities(surface, scene, gain, of_faces)
 
 
 def information_of(inside, bore=RADIUS - WALL):
@@ -303,6 +322,39 @@ def test_a_rounded_rim_is_as_wide_as_its_wall():
     # The cap goes, the rim stays.
     cap, rim = [0.2 * bore, 0, HEIGHT + 0.3 * bore], [RADIUS - 0.5 * WALL, 0, HEIGHT - 0.001]
     assert (cavity.values(np.array([cap, rim])) > 0).tolist() == [True, False]
+
+
+def on_rim_of(wall_at, inner=-1.0):
+    """How well normals agree with a rounded rim on a wall of a thickness at each angle.
+
+    ``inner`` is the least sine between them and the vertical: 0 on the shoulder of a solid.
+    """
+
+    def information(mesh):
+        x, y, _ = mesh.centers.T
+        away = np.hypot(x, y)
+        outwards = (mesh.face_normals[:, :2] * np.stack([x, y], axis=1)).sum(axis=1) / away
+        expected = np.clip(1 - 2 * (RADIUS - away) / wall_at(np.arctan2(y, x)), inner, 1.0)
+        agreement = mesh.face_areas / GSD**2 * (0.2 - np.abs(outwards - expected))
+        return sparse.csr_array(np.tile(agreement, (8, 1)))
+
+    return information
+
+
+@pytest.mark.parametrize(
+    ("swing", "inner", "num"),
+    [(0.0, -1.0, 1), (0.6, -1.0, 0), (0.0, 0.0, 0)],
+    ids=["even wall", "wall of varying width", "shoulder of a solid"],
+)
+def test_a_rim_whose_inner_half_phases_show_on_one_width_opens_into_a_cavity(swing, inner, num):
+    """However bright the opening is."""
+    rim = on_rim_of(lambda angle: WALL * (1 + swing * np.sin(angle)), inner)
+    scene = patch_scene(vessel_maps(dark=1.0), AngleModel.PPA)
+    found = find_cavities(closed_rounded_vessel(), scene, lambda cavity: np.zeros(8), rim)
+    assert len(found) == num
+    for cavity in found:
+        assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
+        assert cavity.thickness_sigma < 0.5 * GSD
 
 
 def test_a_opening_is_round_though_its_cells_are_not():
