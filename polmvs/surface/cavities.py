@@ -3,11 +3,14 @@
 Silhouettes close the opening of a vessel with a cap, which phases hardly support. The inside is
 assumed to follow the outside, at the thickness of the wall.
 
-Light from inside a dark vessel has been reflected several times, and its phase gives no normal. The
-rim around the cap, flat or rounded, is the top of the wall; phases support it, and it gives the
-plane of the opening. At the right offset of this plane, the lines of the rim in all views coincide.
-The inner line of a flat rim is the border of the opening. The width of the rim is the thickness of
-the wall. If the width varies, nothing is inferred.
+The rim around the cap, flat or rounded, is the top of the wall. A rounded rim is a half circle
+across the wall. Its phases give the thickness, and those of its inner half, which faces the axis
+of the opening, show the opening.
+
+Light from inside a dark vessel has been reflected several times, and its phase gives no normal. If
+the rim is flat, it gives the plane of the opening: at the right offset of this plane, the lines of
+the rim in all views coincide. The inner line is the border of the opening. The width of the rim is
+the thickness of the wall. If the width varies, nothing is inferred.
 
 Inside other vessels the phases are those of the walls. The thickness of the wall is the one at
 which they are likeliest, and they must be likelier than on the cap.
@@ -62,10 +65,10 @@ Mask = NDArray[np.bool_]
 SAME_PLANE_PX = HullTolerances.step_px  # GSDs, uncertainty of a rim's plane: a cell of the hull
 MIN_BORDER = 10  # least number of faces of a rim, and of the border of an opening
 THICKNESS_RATIO = 1.25  # of neighbours among the thicknesses that are tried
+THINNEST = -2  # exponent of the ratio, over the width of the rounding: about two cells of the mesh
 NUM_SECTORS = 8  # around an opening
 RIM_CELLS = 8  # across a rounded rim, whose normals turn by 180 deg
-RIM_RATIO = THICKNESS_RATIO ** (1 / 3)  # as 1.25, between thicknesses of a rounded rim: its phases
-# contradict one that is a tenth off
+RIM_RATIO = 1.08  # as 1.25, of a rounded rim: its phases contradict a tenth more or less
 MIN_CAP = 0.5  # of an opening's area, without support of the phases. Guess
 TOP_SECTORS = 36  # in each of which the top of a wall is sought
 PLANE_ROUNDS = 3  # of the fit of a plane to half of a border
@@ -402,7 +405,7 @@ def _likeliest_thickness(
 
     def total(number: int) -> float:
         if number not in gains:
-            cavity = cavity_of(thickness_of(number))
+            cavity = cavity_of(thickness_of(number)) if number >= THINNEST else None
             gains[number] = np.array([-np.inf]) if cavity is None else gain(cavity)
         return float(gains[number].sum())
 
@@ -732,10 +735,18 @@ def _rounded_wall(
     rim = _top_of_wall(surface, opening, plane)
     grid = _grid_about(surface, rim)
     tried = _walls_about(opening, -_outside_at(surface, rim, grid, TOL.rounding), surface.gsd)
-    middle = surface.centers[opening.patch].mean(axis=0)
-    of_rims = [_on_half_circle(surface, rim, middle, wall, information) for wall in tried]
-    if not of_rims:
+    if not tried:
         return None
+    # Only below the radius the outside is that of the wall.
+    starts = np.maximum(TOL.rounding, 0.5 * np.array(tried))
+    insides = surface.inside_along(
+        grid.points(rim).reshape(-1, 3), -rim.normal, starts * grid.step
+    ).reshape(-1, *grid.shape)
+    middle = grid.cells(surface.centers[opening.patch].mean(axis=0))
+    of_rims = [
+        _on_half_circle(wall, -_outside(inside), rim, grid, middle, information)
+        for wall, inside in zip(tried, insides, strict=True)
+    ]
     best = int(np.argmax([found.of_views.sum() for found in of_rims]))
     sectors = np.array([found.inner_of_sectors for found in of_rims])
     shown = of_rims[best]
@@ -758,7 +769,7 @@ def _walls_about(opening: Opening, inwards: Array, gsd: float) -> list[float]:
     ``inwards`` (H, W) are distances from the outside of the wall, in cells of one GSD.
     """
     tried: list[float] = []
-    thickness = TOL.rounding / THICKNESS_RATIO**2
+    thickness = TOL.rounding * THICKNESS_RATIO**THINNEST
     while (open_cells := np.count_nonzero(inwards > thickness)) > np.pi * TOL.rounding**2:
         if opening.area > MIN_CAP * open_cells * gsd**2:
             tried.append(thickness)
@@ -782,26 +793,34 @@ class _RimInformation:
 
 
 def _on_half_circle(
-    surface: SurfaceFaces, rim: Patch, middle: Array, thickness: float, information: Information
+    thickness: float,
+    inwards: Array,
+    rim: Patch,
+    grid: PatchGrid,
+    middle: Array,
+    information: Information,
 ) -> _RimInformation:
     """Information on the half circle across a wall.
 
-    ``rim`` is the plane through its top, ``middle`` (3,) a point of the opening, ``thickness`` in
-    GSD.
+    Parameters
+    ----------
+    thickness : of the wall, in cells.
+    inwards : (H, W) distance from the outside of the wall, in cells.
+    rim, grid : plane through the top of the wall, and the grid across it.
+    middle : (2,), cell in the opening.
+    information : (V, F) of each view's phases on the faces of a mesh.
     """
-    radius = 0.5 * thickness
-    grid = _grid_about(surface, rim).at_step(thickness * surface.gsd / RIM_CELLS)
-    start = max(TOL.rounding, radius)  # only below it the outside is that of the wall
-    depth = start * surface.gsd / grid.step
-    outer = ndimage.gaussian_filter(_outside_at(surface, rim, grid, depth), 1.0, mode="nearest")
-    inwards = -outer * grid.step / surface.gsd
+    radius, fine = 0.5 * thickness, grid.at_step(thickness * grid.step / RIM_CELLS)
+    places = np.indices(fine.shape) * (fine.step / grid.step)
+    smooth = ndimage.gaussian_filter(inwards, 1.0, mode="nearest")
+    inwards = ndimage.map_coordinates(smooth, places, order=1, mode="nearest")
     across = np.clip(inwards, 0, thickness)
     height = np.sqrt(across * (thickness - across)) - radius
-    points = grid.points(rim) + height[..., None] * surface.gsd * rim.normal
+    points = fine.points(rim) + height[..., None] * grid.step * rim.normal
     mesh = height_field(points, (inwards >= 0) & (inwards <= thickness))
     cells = grid.cells(mesh.centers)
-    inner = ndimage.map_coordinates(inwards, cells.T, order=1) > radius
-    sector = _sectors(*(cells - grid.cells(middle)).T)
+    inner = ndimage.map_coordinates(smooth, cells.T, order=1) > radius
+    sector = _sectors(*(cells - middle).T)
     found = information(mesh)
     of_faces = np.asarray(found.sum(axis=0))
     return _RimInformation(

@@ -67,7 +67,8 @@ class SearchTolerances:
         view.
     num_cells : of the coarse grid, along its side; the fine one has as many along the object's.
     num_rounds : of prediction and carving; a third changes the outlines by 0.1 px.
-    inner_px : distance from the outline of what is well within the object, working pixels.
+    inner_share : of an image's longest side, distance from the outline of what is well within the
+        object.
     polarized_share : of an object within its outline that is polarized if polarization shows all
         of it: its region is then complete. In the median view.
     least_polarized_share : the same of a single view, and of its polarized region within the
@@ -88,7 +89,7 @@ class SearchTolerances:
     seen_share: float = 0.6
     num_cells: int = 72
     num_rounds: int = 2
-    inner_px: float = 12.0
+    inner_share: float = 0.02
     polarized_share: float = 0.99
     least_polarized_share: float = 0.9
 
@@ -315,7 +316,8 @@ def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[i
     shares, beside, grown = np.full(len(views), np.nan), *np.zeros((2, len(views)))
     for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
         distance = signed_distance_px(mask)
-        inner, outer = distance < -TOL.inner_px, distance > TOL.inner_px
+        reach = TOL.inner_share * max(mask.shape)
+        inner, outer = distance < -reach, distance > reach
         if inner.any():
             shares[index] = view.region[inner].mean()
         if view.polarized.any():
@@ -879,7 +881,7 @@ def _found(
     behind = partial(_behind, views, index, plate, plane)
     distance = find_outline(view.intensity, coarse, behind, noise, start_px=view.factor)
     found = distance < 0
-    inner = coarse < -TOL.inner_px * view.factor
+    inner = coarse < -TOL.inner_share * max(coarse.shape)
     return FoundObject(found, smooth_distance_px(found) - distance, inner)
 
 
