@@ -749,8 +749,7 @@ def _rounded_wall(
     ]
     best = int(np.argmax([found.of_views.sum() for found in of_rims]))
     sectors = np.array([found.inner_of_sectors for found in of_rims])
-    shown = of_rims[best]
-    if not all(map(_agree, (shown.of_views, shown.inner_of_views, sectors[best]))):
+    if not _agree(of_rims[best].of_views) or not _agree(sectors[best]):
         return None
     thickness = tried[best]
     if 0 < best < len(tried) - 1:
@@ -783,12 +782,11 @@ class _RimInformation:
 
     Attributes
     ----------
-    of_views, inner_of_views : (V,) of each view, on the rim and on its inner half.
-    inner_of_sectors : (8,) of the inner half in each sector about the opening.
+    of_views : (V,) of each view.
+    inner_of_sectors : (8,) on the inner half in each sector about the opening.
     """
 
     of_views: Array
-    inner_of_views: Array
     inner_of_sectors: Array
 
 
@@ -825,7 +823,6 @@ def _on_half_circle(
     of_faces = np.asarray(found.sum(axis=0))
     return _RimInformation(
         np.asarray(found.sum(axis=1)),
-        np.asarray(found @ inner.astype(np.float64)),
         np.bincount(sector[inner], of_faces[inner], NUM_SECTORS).astype(np.float64),
     )
 

@@ -14,6 +14,7 @@ from analytic_objects import (
     union,
 )
 
+from polmvs.camera import pixel_centers
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.region import Region
 from polmvs.scene import Seeds
@@ -314,6 +315,42 @@ def test_the_inside_of_a_wall_of_five_pixels_is_found():
     assert np.percentile(np.abs(tumbler()(centers)), 75) < 0.25 * GSD
     on_wall = np.abs(np.hypot(centers[:, 0], centers[:, 1]) - 0.9 + 5 * GSD) < 0.25 * GSD
     assert on_wall.mean() > 0.25
+
+
+def tumbler_with_round_rim(p, radius=0.9, wall=8 * GSD, half_height=0.9):
+    """The vessel with a half circle on its wall."""
+    from_axis, height = np.hypot(p[..., 0], p[..., 1]), p[..., 2]
+    across, above = from_axis - radius + 0.5 * wall, height - half_height + 0.5 * wall
+    side = np.where(above > 0, np.hypot(across, above), np.abs(across)) - 0.5 * wall
+    floor = np.maximum(from_axis - radius, height + half_height - 2 * wall)
+    return np.maximum(np.minimum(side, floor), -half_height - height)
+
+
+def test_walls_that_the_rim_shows_are_inferred_where_phases_deny_them():
+    """Light in a vessel was reflected several times: here its phases are those of no surface."""
+    views, maps = ring_of_views(12, elevations=(30.0, 60.0)), []
+    turns = np.random.default_rng(0).uniform(0, 2 * np.pi, len(views))
+    made = phase_maps_of(tumbler_with_round_rim, views, noise=np.radians(0.5))
+    for one, turn in zip(made, turns, strict=True):
+        ranges, _ = trace(tumbler_with_round_rim, one.view)
+        xy = pixel_centers(one.view.camera.width, one.view.camera.height)
+        rays = one.view.rays_in_world(xy)
+        x, y, z = np.moveaxis(
+            one.view.center_in_world + np.nan_to_num(ranges, posinf=0.0)[..., None] * rays, -1, 0
+        )
+        inside = (np.hypot(x, y) < 0.9 - 7.9 * GSD) & (z < 0.9 - 4 * GSD) & np.isfinite(ranges)
+        turned = one.polarization.copy()
+        cosine, sine = np.cos(turn), np.sin(turn)
+        turned[inside, :2] = turned[inside, :2] @ np.array([[cosine, sine], [-sine, cosine]])
+        maps.append(one.changed(polarization=turned))
+    found = reconstruct(maps, masks_given=True)
+    assert not isinstance(found, Undetermined)
+    centers = found.mesh.centers
+    from_axis = np.hypot(centers[:, 0], centers[:, 1])
+    on_wall = (np.abs(from_axis - 0.9 + 8 * GSD) < GSD) & (np.abs(centers[:, 2] - 0.2) < 0.3)
+    assert on_wall.sum() > 500
+    assert found.inferred[on_wall].mean() > 0.8
+    assert not found.contradicted[on_wall].any()
 
 
 def drum(points):

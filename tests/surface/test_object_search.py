@@ -302,6 +302,18 @@ def test_what_polarization_shows_is_left_to_it(white):
     assert hidden_plane(mostly, tracks) is not None
 
 
+@pytest.mark.parametrize(("lacks", "is_searched"), [(0.01, False), (0.03, True)])
+def test_a_border_that_polarization_lacks_in_all_views_is_searched(white, lacks, is_searched):
+    """``lacks`` is its width over the image's."""
+    found = find_object(white, TABLE, table_points())
+    assert found is not None
+    polarized = []
+    for one, hiding in zip(white, found, strict=True):
+        region = signed_distance_px(hiding.mask) < -lacks * one.view.camera.width
+        polarized.append(one.changed(region=Region(region, region, ~region)))
+    assert (find_object(polarized, TABLE, table_points()) is not None) == is_searched
+
+
 def test_the_outline_found_is_the_silhouette(white):
     found = find_object(white, TABLE, table_points())
     assert found is not None
