@@ -734,19 +734,23 @@ def _rounded_wall(
     """
     rim = _top_of_wall(surface, opening, plane)
     grid = _grid_about(surface, rim)
-    tried = _walls_about(opening, -_outside_at(surface, rim, grid, TOL.rounding), surface.gsd)
-    if not tried:
+    walls = _walls_about(opening, -_outside_at(surface, rim, grid, TOL.rounding), surface.gsd)
+    if not walls:
         return None
     # Only below the radius the outside is that of the wall.
-    starts = np.maximum(TOL.rounding, 0.5 * np.array(tried))
+    starts = np.maximum(TOL.rounding, 0.5 * np.array(walls))
     insides = surface.inside_along(
         grid.points(rim).reshape(-1, 3), -rim.normal, starts * grid.step
     ).reshape(-1, *grid.shape)
     middle = grid.cells(surface.centers[opening.patch].mean(axis=0))
-    of_rims = [
-        _on_half_circle(wall, -_outside(inside), rim, grid, middle, information)
-        for wall, inside in zip(tried, insides, strict=True)
-    ]
+    tried, of_rims = [], []
+    for wall, inside in zip(walls, insides, strict=True):
+        found = _on_half_circle(wall, -_outside(inside), rim, grid, middle, information)
+        if found is not None:
+            tried.append(wall)
+            of_rims.append(found)
+    if not of_rims:
+        return None
     best = int(np.argmax([found.of_views.sum() for found in of_rims]))
     sectors = np.array([found.inner_of_sectors for found in of_rims])
     if not _agree(of_rims[best].of_views) or not _agree(sectors[best]):
@@ -797,8 +801,8 @@ def _on_half_circle(
     grid: PatchGrid,
     middle: Array,
     information: Information,
-) -> _RimInformation:
-    """Information on the half circle across a wall.
+) -> _RimInformation | None:
+    """Information on the half circle across a wall; None of a wall that is not there.
 
     Parameters
     ----------
@@ -816,6 +820,8 @@ def _on_half_circle(
     height = np.sqrt(across * (thickness - across)) - radius
     points = fine.points(rim) + height[..., None] * grid.step * rim.normal
     mesh = height_field(points, (inwards >= 0) & (inwards <= thickness))
+    if not len(mesh.faces):
+        return None
     cells = grid.cells(mesh.centers)
     inner = ndimage.map_coordinates(smooth, cells.T, order=1) > radius
     sector = _sectors(*(cells - middle).T)

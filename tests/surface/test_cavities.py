@@ -372,6 +372,25 @@ def test_a_rim_whose_inner_half_phases_show_on_one_width_opens_into_a_cavity(swi
         assert cavity.thickness_sigma < 0.5 * GSD
 
 
+def test_rims_deeper_than_a_shallow_body_are_not_asked_for():
+    surface, asked = closed_rounded_vessel(), []
+    below = HEIGHT - 8 * GSD
+
+    def inside_along(origins, direction, distances):
+        points = origins + distances[:, None, None] * direction
+        return surface.inside_along(origins, direction, distances) & (points[..., 2] > below)
+
+    def rim(mesh):
+        asked.append(len(mesh.faces))
+        return on_rim_of(lambda angle: np.full_like(angle, WALL))(mesh)
+
+    shallow = replace(surface, inside_along=inside_along)
+    scene = patch_scene(vessel_maps(dark=1.0), AngleModel.PPA)
+    find_cavities(shallow, scene, lambda cavity: np.zeros(8), rim)
+    assert len(asked) > 5
+    assert min(asked) > 0
+
+
 def test_a_opening_is_round_though_its_cells_are_not():
     """To a tenth of a pixel; cut at whole cells it goes in and out by 0.15."""
     (cavity,) = found_in(closed_cylinder(), vessel_maps())
