@@ -249,11 +249,13 @@ def find_cavities(
             continue
         if any(_is_same(plane, other.rim, surface) for other in found):
             continue
-        cavity = _rounded_cavity(surface, opening, plane, information)
+        enclosed = _is_enclosed(surface, opening, plane)
+        top = _top_of_wall(surface, opening, plane) if enclosed else None
+        cavity = None if top is None else _rounded_cavity(surface, opening, top, information)
         if cavity is None:
             cavity = _dark_cavity(surface, opening, plane, scene)
-        if cavity is None:
-            cavity = _bright_cavity(surface, opening, plane, gain)
+        if cavity is None and top is not None:
+            cavity = _bright_cavity(surface, opening, top, gain)
         if cavity is not None:
             found.append(cavity)
     return tuple(found)
@@ -311,13 +313,12 @@ def _is_enclosed(surface: SurfaceFaces, opening: Opening, plane: Patch) -> bool:
 
 
 def _rounded_cavity(
-    surface: SurfaceFaces, opening: Opening, plane: Patch, information: Information
+    surface: SurfaceFaces, opening: Opening, rim: Patch, information: Information
 ) -> Cavity | None:
-    """The cavity within a rounded rim."""
-    if not _is_enclosed(surface, opening, plane):
-        return None
-    wall = _rounded_wall(surface, opening, plane, information)
-    return None if wall is None else _cavity(surface, wall, _grid_about(surface, wall.rim), opening)
+    """The cavity within a rounded rim; ``rim`` is the plane through its top."""
+    grid = _grid_about(surface, rim)
+    wall = _rounded_wall(surface, opening, rim, grid, information)
+    return None if wall is None else _cavity(surface, wall, grid, opening)
 
 
 def _dark_cavity(
@@ -333,17 +334,15 @@ def _dark_cavity(
 
 
 def _bright_cavity(
-    surface: SurfaceFaces, opening: Opening, plane: Patch, gain: Gain
+    surface: SurfaceFaces, opening: Opening, rim: Patch, gain: Gain
 ) -> Cavity | None:
     """The cavity with the wall at which the phases are likeliest; None if the cap explains them.
 
     The rim is flat or rounded. The wrong shape makes the wall too thin, because a narrower rim
-    contradicts fewer phases, so the thicker wall is taken. ``gain`` is the information that a
-    cavity adds.
+    contradicts fewer phases, so the thicker wall is taken. ``rim`` is the plane
+    through its top, ``gain`` the information that a cavity adds.
     """
-    if not _is_enclosed(surface, opening, plane):
-        return None
-    cavity_of = _cavities_within(surface, opening, _top_of_wall(surface, opening, plane))
+    cavity_of = _cavities_within(surface, opening, rim)
     found = []
     for is_round in (False, True):
         likeliest = _likeliest_thickness(partial(cavity_of, is_round), gain)
@@ -725,15 +724,17 @@ def _flat_wall(
 
 
 def _rounded_wall(
-    surface: SurfaceFaces, opening: Opening, plane: Patch, information: Information
+    surface: SurfaceFaces,
+    opening: Opening,
+    rim: Patch,
+    grid: PatchGrid,
+    information: Information,
 ) -> _Wall | None:
     """The wall under a rim that is a half circle across, of the radius that is likeliest.
 
     The inner half of the rim faces the axis of the opening, which no cap does. So its phases also
-    show that there is an opening. None if they do not. ``plane`` is that of the opening's border.
+    show that there is an opening. None if they do not. ``rim`` is the plane through its top.
     """
-    rim = _top_of_wall(surface, opening, plane)
-    grid = _grid_about(surface, rim)
     walls = _walls_about(opening, -_outside_at(surface, rim, grid, TOL.rounding), surface.gsd)
     if not walls:
         return None

@@ -134,8 +134,8 @@ class GlobalSurface:
     sigma : (V,) standard deviation of the position along the normal, world units; inf if unknown.
     gsd : ground sampling distance at the surface, world units.
     contradictions : between the surface and the data.
-    inferred : (F,) bool, faces that no phase shows: walls of cavities, inferred with the thickness
-        that the opening shows.
+    inferred : (F,) bool, walls of cavities without phases, or, where the rim gives the thickness,
+        with phases of light that was reflected several times.
     contradicted : (F,) bool, faces that phases contradict: without points and depths.
     tilt_share : as in :class:`polmvs.surface.observations.Looking`.
     left_out : (K,) bool, inconsistent views; the surface is made without them.
