@@ -11,8 +11,9 @@ from polmvs.config import CaptureOptions, EvaluationOptions, Options, RunOptions
 from polmvs.errors import PolmvsError
 from polmvs.evaluation.comparison import ModelFigures
 from polmvs.evaluation.tables import format_table
+from polmvs.evaluation.trust import Trust
 from polmvs.io.clouds import Mesh
-from polmvs.pipeline.jobs import compare
+from polmvs.pipeline.jobs import compare, judge
 from polmvs.pipeline.runner import Job
 from polmvs.polarization.kinds import AngleModel
 from polmvs.simulation.capture import simulate_capture
@@ -28,6 +29,7 @@ HEADER = (  # but for the name
     "F 1 mm, %",
     "F 2 mm, %",
     "normals, median deg",
+    "trusted",
     "s",
     "",
 )
@@ -44,8 +46,9 @@ class TrialResult:
     points : of the cloud's surface.
     completeness, f_score : at 1 and 2 mm, shares; NaN without a result.
     normal_median_deg : error of the cloud's normals.
-    seconds : of the reconstruction.
-    message : why there is no result, else empty.
+    is_trusted : by the quality checks; None without a result.
+    seconds : of the reconstruction and its checks.
+    message : why there is no result, or why it is not to be trusted; else empty.
     """
 
     name: str
@@ -55,6 +58,7 @@ class TrialResult:
     completeness: tuple[float, float] = (0.0, 0.0)
     f_score: tuple[float, float] = (0.0, 0.0)
     normal_median_deg: float = float("nan")
+    is_trusted: bool | None = None
     seconds: float = 0.0
     message: str = ""
 
@@ -70,6 +74,7 @@ class TrialResult:
             f"{100 * self.f_score[0]:.1f}",
             f"{100 * self.f_score[1]:.1f}",
             f"{self.normal_median_deg:.2f}",
+            {True: "yes", False: "no", None: "-"}[self.is_trusted],
             f"{self.seconds:.0f}",
             self.message,
         )
@@ -133,6 +138,7 @@ def measure(
     trial = TrialResult(name=name, views=views)
     try:
         outcome = compare(job, tuple(models))
+        trusts = [judge(outcome.run_folder, model) for model in models]
     except PolmvsError as error:
         message = " ".join(str(error).split())[:160]
         failed = replace(trial, seconds=time.perf_counter() - begun, message=message)
@@ -145,10 +151,13 @@ def measure(
         posed=comparison.sparse.num_views,
         message=outcome.empty or "",
     )
-    return [_with_figures(trial, comparison.models[model]) for model in models]
+    return [
+        _with_figures(trial, comparison.models[model], trust)
+        for model, trust in zip(models, trusts, strict=True)
+    ]
 
 
-def _with_figures(trial: TrialResult, figures: ModelFigures) -> TrialResult:
+def _with_figures(trial: TrialResult, figures: ModelFigures, trust: Trust) -> TrialResult:
     if figures.truth is None:
         return trial
     cloud = figures.truth.cloud
@@ -158,6 +167,8 @@ def _with_figures(trial: TrialResult, figures: ModelFigures) -> TrialResult:
         completeness=(cloud.completeness[0], cloud.completeness[1]),
         f_score=(cloud.f_score[0], cloud.f_score[1]),
         normal_median_deg=cloud.normal_median_deg,
+        is_trusted=trust.is_trusted,
+        message=trial.message or ("" if trust.is_trusted else trust.verdict),
     )
 
 
