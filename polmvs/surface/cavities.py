@@ -135,11 +135,23 @@ class Cavity:
     @property
     def is_deep(self) -> bool:
         """Whether it is deeper than wide: light in it was reflected several times."""
-        free = self.field > 0
-        lowest = int(np.flatnonzero(free.any(axis=(1, 2))).max(initial=0))
-        area = int(free[-self.first_layer].sum()) * self.grid.step**2
-        depth = (lowest + self.first_layer) * self.layer_step
-        return bool(depth > 2 * np.sqrt(area / np.pi))
+        area = np.count_nonzero(self.field[-self.first_layer] > 0) * self.grid.step**2
+        return bool(self.depth > 2 * np.sqrt(area / np.pi))
+
+    @property
+    def depths(self) -> Array:
+        """(D,) of the layers below the rim, world units."""
+        return self.layer_step * (self.first_layer + np.arange(len(self.field), dtype=np.float64))
+
+    @property
+    def depth(self) -> float:
+        """Of its lowest free layer, world units."""
+        return float(self.depths[(self.field > 0).any(axis=(1, 2))].max(initial=0.0))
+
+    def above(self, depth: float) -> Cavity:
+        """Its part above a floor at a depth below the rim."""
+        floor = (depth - self.depths).astype(np.float32)
+        return replace(self, field=np.minimum(self.field, floor[:, None, None]))
 
     def values(self, points: Floats) -> Array:
         """Signed distance ``(N,)`` of points, positive in the cavity's free space."""
@@ -252,6 +264,8 @@ def find_cavities(
         enclosed = _is_enclosed(surface, opening, plane)
         top = _top_of_wall(surface, opening, plane) if enclosed else None
         cavity = None if top is None else _rounded_cavity(surface, opening, top, information)
+        if cavity is not None and not _is_dark_inside(cavity, scene.maps):
+            cavity = _likeliest_floor(cavity, gain)
         if cavity is None:
             cavity = _dark_cavity(surface, opening, plane, scene)
         if cavity is None and top is not None:
@@ -430,6 +444,34 @@ def _vertex(below: Array, here: Array, above: Array) -> tuple[float, float]:
         if bend < 0:
             return -float(slope.mean()) / bend, _sigma_of_mean(slope) / -bend
     return 0.0, 1.0
+
+
+def _likeliest_floor(cavity: Cavity, gain: Gain) -> Cavity:
+    """A cavity with its floor at the likeliest depth: at the bottom unless most views deny it.
+
+    A sunk lid is a floor below a rim as well. Light that was reflected several times biases the
+    phases on the right walls, too, so only floors are compared.
+    """
+    step = cavity.grid.step
+
+    @cache
+    def information(exponent: float) -> Array:
+        depth = cavity.depth * 2.0**exponent
+        return gain(cavity.above(depth)) if depth > TOL.rounding * step else -np.inf * at_bottom
+
+    at_bottom = gain(cavity)
+    lowest = int(np.log2(cavity.depth / (TOL.rounding * step)))
+    if lowest < 1:
+        return cavity
+    best = float(max(range(-lowest, 0), key=lambda exponent: information(exponent).sum()))
+    if not _agree(information(best) - at_bottom):
+        return cavity
+    halving = 0.5
+    while cavity.depth * (2.0 ** (best + halving) - 2.0**best) > step:
+        near = (best - halving, best, best + halving)
+        best = max(near, key=lambda exponent: information(exponent).sum())
+        halving *= 0.5
+    return cavity.above(cavity.depth * 2.0**best)
 
 
 def _top_of_wall(surface: SurfaceFaces, opening: Opening, plane: Patch) -> Patch:
@@ -624,6 +666,14 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap]) -> bool:
     """Whether half of points ``(N, 3)`` are much darker than a ring ``(R, 3)``."""
     dark = _brightness(inner, ring, maps) < TOL.max_brightness
     return bool(len(dark) and dark.mean() > 0.5)
+
+
+def _is_dark_inside(cavity: Cavity, maps: Sequence[PhaseMap]) -> bool:
+    """Whether the opening of a cavity is much darker than its rim."""
+    open_cells = np.asarray(cavity.field[-cavity.first_layer] > 0)
+    inner = ndimage.binary_erosion(open_cells, iterations=3)
+    places = cavity.grid.points(cavity.rim)
+    return _is_dark(places[inner], places[_ring_about(open_cells)], maps)
 
 
 def _brightness(points: Array, ring: Array, maps: Sequence[PhaseMap]) -> Array:

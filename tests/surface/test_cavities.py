@@ -170,7 +170,7 @@ def closed_rounded_vessel():
         points = origins + distances[:, None, None] * direction
         far, z = np.hypot(points[..., 0], points[..., 1]), points[..., 2]
         lip = (np.hypot(far - RADIUS + minor, z - middle) < minor) & (z > middle)
-        return ((far < RADIUS) & (z > 0) & (z < middle)) | lip | ((far < bore) & (z < middle))
+        return ((far < RADIUS) & (z > 0) & (z < middle)) | lip
 
     patch = number >= len(profile)
     border = number == len(profile) - 1
@@ -370,6 +370,27 @@ def test_a_rim_whose_inner_half_phases_show_on_one_width_opens_into_a_cavity(swi
     for cavity in found:
         assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
         assert cavity.thickness_sigma < 0.5 * GSD
+
+
+@pytest.mark.parametrize(
+    ("gains", "dark", "depth"),
+    [
+        ([1.0] * 8, 1.0, 0.03),
+        ([9.0, 9, -1, -1, -1, -1, -1, -1], 1.0, HEIGHT - WALL),
+        ([1.0] * 8, 0.02, HEIGHT - WALL),
+    ],
+    ids=["a lid that all views show", "views that disagree", "a dark inside"],
+)
+def test_a_sunk_lid_below_a_rim_is_where_phases_are_likeliest(gains, dark, depth):
+    def gain(cavity):
+        return -np.array(gains) * np.log(cavity.depth / 0.03) ** 2
+
+    rim = on_rim_of(lambda angle: np.full_like(angle, WALL))
+    scene = patch_scene(vessel_maps(dark=dark), AngleModel.PPA)
+    (cavity,) = find_cavities(closed_rounded_vessel(), scene, gain, rim)
+    assert cavity.depth == pytest.approx(depth, abs=3 * GSD)
+    on_axis = np.array([[0, 0, HEIGHT - depth + 4 * GSD], [0, 0, HEIGHT - depth - 4 * GSD]])
+    assert (cavity.values(on_axis) > 0).tolist() == [True, False]
 
 
 def test_rims_deeper_than_a_shallow_body_are_not_asked_for():
