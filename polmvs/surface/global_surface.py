@@ -54,7 +54,7 @@ from polmvs.surface.offsets import (
     stepped_patches,
 )
 from polmvs.surface.open_scene import open_scene
-from polmvs.surface.phase_bias import Bias, find_bias
+from polmvs.surface.phase_bias import MIN_POINTS, Bias, find_bias
 from polmvs.surface.solver import (
     Fit,
     Labelled,
@@ -229,10 +229,9 @@ def reconstruct_surface(
     if isinstance(first, Undetermined):
         return first
     logger.info("first surface: %d vertices.", len(first.mesh.vertices))
-    views = first.views
     given = _Given(
         scene=patch_scene(
-            [view.phase_map for view in views],
+            [view.phase_map for view in first.views],
             looking.angle_model,
             tilt_aware=looking.tilt_aware,
             folder=folder,
@@ -241,53 +240,30 @@ def reconstruct_surface(
         min_views=min_views,
         on_progress=on_progress,
     )
-    fit = first_fit(views, looking, first.gsd, known=first.known, tolerances=tolerances)
-    walls: SignedDistance | None = None
-    steps: tuple[SteppedPatches, ...] = ()
-    if first.hull is not None:
-        hull, walls = opened_hull(first.hull, first.plane, fit)
-        first = replace(first, mesh=hull.mesh, hull=hull)
-        if walls is None:
-            first = first.carved(given.steps(RayScene(first.mesh), is_refined=False))
-        else:  # its floor is refined; it is no height step
-            logger.info("a vessel, open at the top.")
+    fit = first_fit(first.views, looking, first.gsd, known=first.known, tolerances=tolerances)
+    first = first.opened(given, fit)
     refined = refine(
         first.mesh,
         fit,
         stands_apart=partial(stand_apart, least=MIN_EXPLAINED),
-        walls=walls,
+        walls=first.walls,
         on_progress=on_progress,
     )
-    _warn_of_inconsistent(looking.angle_model, views, refined)
+    _warn_of_inconsistent(looking.angle_model, first.views, refined)
     if not len(refined.mesh.faces):
         return Undetermined("the surface vanishes under the phases of the views")
     given = replace(given, scene=given.scene.of(~refined.left_out))
-    mesh, fit, is_biased = refined.mesh, refined.fit, False
-    cavities: tuple[Cavity, ...] = ()
-    if first.hull is not None:
-        scene = RayScene(mesh)
-        cavities = _cavities(given, refined, scene)
-        if walls is None:
-            cell = HullTolerances.step_px * first.gsd
-            steps = tuple(
-                group
-                for group in given.steps(scene, is_refined=True)
-                if not first.loses_silhouettes(mesh, _carved(scene, cell, first.hull, [group]))
-            )
-            logger.info("%d groups of planar patches.", len(steps))
-        # Outlines hold the surface; without the points, these show the bias of its phases.
-        free = replace(fit, known=None)
-        moved = iterated(mesh, free)
-        is_biased = _bias(moved, label(moved, free), free, first.known) is not None
-        if is_biased:
-            mesh, fit, refined = moved, free, replace(refined, mesh=moved)
-        if steps or cavities:
-            edge = mesh.mean_edge / REMESHED_EDGE
-            mesh = _carved(RayScene(mesh), edge, first.hull, steps, cavities)
-    if not len(mesh.faces):
+    steps, cavities = _carvings(given, first, refined)
+    free = _free_of_points(first, refined)
+    mesh, fit = (refined.mesh, refined.fit) if free is None else free
+    carved = mesh
+    if first.hull is not None and (steps or cavities):
+        edge = mesh.mean_edge / REMESHED_EDGE
+        carved = _carved(RayScene(mesh), edge, first.hull, steps, cavities)
+    if not len(carved.faces):
         return Undetermined("the surface vanishes under the cavities found in it")
-    polished = _polished(given, mesh, fit, refined, [*steps, *cavities])
-    if is_biased:
+    polished = _polished(given, carved, fit, replace(refined, mesh=mesh), [*steps, *cavities])
+    if free is not None:
         polished = replace(_unbiased(polished, first.known), fit=refined.fit)
     surface = _supported(given, polished, steps, cavities, refined.left_out)
     surface = replace(surface, levels=(first.mesh, *refined.meshes))
@@ -310,6 +286,7 @@ class _First:
     gsd : ground sampling distance at the surface, world units.
     hull : whose surface it is; None for an open scene.
     plane : on which the objects stand, if it is known.
+    walls : of a vessel, which coarse meshes lose.
     """
 
     mesh: TriangleMesh
@@ -318,6 +295,18 @@ class _First:
     gsd: float
     hull: VisualHull | None = None
     plane: SupportingPlane | None = None
+    walls: SignedDistance | None = None
+
+    def opened(self, given: _Given, fit: Fit) -> _First:
+        """The hull without the inside of a vessel, or without the space above planar patches."""
+        if self.hull is None:
+            return self
+        hull, walls = opened_hull(self.hull, self.plane, fit)
+        opened = replace(self, mesh=hull.mesh, hull=hull, walls=walls)
+        if walls is None:
+            return opened.carved(given.steps(RayScene(hull.mesh), is_refined=False))
+        logger.info("a vessel, open at the top.")  # its floor is refined; it is no height step
+        return opened
 
     def carved(self, steps: Sequence[SteppedPatches]) -> _First:
         """The hull without the space above the planar patches that lose no silhouettes."""
@@ -623,6 +612,40 @@ def _converged(
         if fit.known is not None and points_deny(mesh, sharp, fit.known, fit.gsd):
             return sharp
     return mesh
+
+
+def _carvings(
+    given: _Given, first: _First, refined: Refined
+) -> tuple[Sequence[SteppedPatches], Sequence[Cavity]]:
+    """The height steps and cavities of a refined surface."""
+    hull = first.hull
+    if hull is None:
+        return (), ()
+    scene = RayScene(refined.mesh)
+    cavities = _cavities(given, refined, scene)
+    if first.walls is not None:
+        return (), cavities
+    cell = HullTolerances.step_px * first.gsd
+    steps = [
+        group
+        for group in given.steps(scene, is_refined=True)
+        if not first.loses_silhouettes(refined.mesh, _carved(scene, cell, hull, [group]))
+    ]
+    logger.info("%d groups of planar patches.", len(steps))
+    return steps, cavities
+
+
+def _free_of_points(first: _First, refined: Refined) -> tuple[TriangleMesh, Fit] | None:
+    """The surface and fit without known points, if these show that its phases are biased.
+
+    Outlines hold the surface meanwhile.
+    """
+    if first.hull is None or len(first.known.points) < MIN_POINTS:
+        return None
+    free = replace(refined.fit, known=None)
+    moved = iterated(refined.mesh, free)
+    bias = _bias(moved, label(moved, free), free, first.known)
+    return None if bias is None else (moved, free)
 
 
 def _cavities(given: _Given, refined: Refined, scene: RayScene) -> tuple[Cavity, ...]:
