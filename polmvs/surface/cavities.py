@@ -1,11 +1,12 @@
 """Cavities of vessels, such as the inside of a mug.
 
-Silhouettes close the opening of a vessel with a cap, which phases hardly support. The inside is
-assumed to follow the outside, at the thickness of the wall.
+Silhouettes close the opening of a vessel with a cap. Phases hardly support it, except those of
+mirror images in metal, so each part that faces upwards may be a cap as well. The inside is assumed
+to follow the outside, at the thickness of the wall.
 
 The rim around the cap, flat or rounded, is the top of the wall. A rounded rim is a half circle
 across the wall. Its phases give the thickness, and those of its inner half, which faces the axis
-of the opening, show the opening.
+of the opening, show the opening. Below it phases may show a floor, such as a sunk lid.
 
 Light from inside a dark vessel has been reflected several times, and its phase gives no normal. If
 the rim is flat, it gives the plane of the opening: at the right offset of this plane, the lines of
@@ -21,7 +22,7 @@ an inference, not a measurement, and points on them should be labelled as inferr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import TypeAlias
@@ -69,7 +70,6 @@ THINNEST = -2  # exponent of the ratio, over the width of the rounding: about tw
 NUM_SECTORS = 8  # around an opening
 RIM_CELLS = 8  # across a rounded rim, whose normals turn by 180 deg
 RIM_RATIO = 1.08  # as 1.25, of a rounded rim: its phases contradict a tenth more or less
-MIN_CAP = 0.5  # of an opening's area, without support of the phases. Guess
 TOP_SECTORS = 36  # in each of which the top of a wall is sought
 PLANE_ROUNDS = 3  # of the fit of a plane to half of a border
 
@@ -148,6 +148,11 @@ class Cavity:
         """Of its lowest free layer, world units."""
         return float(self.depths[(self.field > 0).any(axis=(1, 2))].max(initial=0.0))
 
+    def is_below(self, point: Array) -> bool:
+        """Whether a point (3,), projected to the plane of the rim, lies in the opening."""
+        in_plane = point - self.rim.height(point) * self.rim.normal
+        return bool(self.values(in_plane[None])[0] > 0)
+
     def above(self, depth: float) -> Cavity:
         """Its part above a floor at a depth below the rim."""
         floor = (depth - self.depths).astype(np.float32)
@@ -172,18 +177,21 @@ Information: TypeAlias = Callable[[TriangleMesh], sparse.csr_array]
 
 @dataclass(frozen=True)
 class Opening:
-    """A connected patch of a closed surface that the phases do not support.
+    """A connected patch of a closed surface that may be a cap over a cavity.
 
     Attributes
     ----------
     patch : (P,) indices of its faces.
-    border : (B,) indices of the supported faces about it.
+    border : (B,) indices of the faces about it.
     area : of the patch, world units squared.
+    is_supported : whether phases support the patch. Those of mirror images in polished metal agree
+        with a cap; then only the rim tells that it is one.
     """
 
     patch: Indices
     border: Indices
     area: float
+    is_supported: bool = False
 
 
 @dataclass(frozen=True)
@@ -194,7 +202,7 @@ class SurfaceFaces:
     ----------
     centers, normals : (F, 3), world; unit normals outwards.
     supported : (F,) bool, faces whose phases support them.
-    openings : patches that may close a cavity, largest first.
+    openings : patches that may close a cavity: those without support first, largest first.
     inside_along : which points ``(D, N)`` lie inside, on rays from origins ``(N, 3)`` along one
         direction ``(3,)``, at ascending distances ``(D,)``.
     gsd : ground sampling distance at the surface, world units.
@@ -208,7 +216,9 @@ class SurfaceFaces:
     gsd: float
 
 
-def surface_faces(scene: RayScene, seen: Mask, supported: Mask, gsd: float) -> SurfaceFaces:
+def surface_faces(
+    scene: RayScene, seen: Mask, supported: Mask, gsd: float, upwards: Array | None = None
+) -> SurfaceFaces:
     """The faces of a closed mesh, with the openings among them.
 
     Parameters
@@ -217,24 +227,41 @@ def surface_faces(scene: RayScene, seen: Mask, supported: Mask, gsd: float) -> S
     seen : (F,), faces that views see.
     supported : (F,), faces whose phases support them.
     gsd : ground sampling distance at the surface, world units.
+    upwards : (3,) direction in which objects that stand on a plane are open; None: unknown.
     """
     mesh = scene.mesh
     pieces = mesh.pieces(supported)
     area = np.bincount(pieces + 1, mesh.face_areas)[1:]
     # Phases may support islands of a cap by chance.
     is_body = (pieces >= 0) & (pieces == (np.argmax(area) if len(area) else 0))
-    patches = mesh.pieces(seen & ~is_body)
-    area = np.bincount(patches + 1, mesh.face_areas)[1:]
-    openings = []
-    for number in np.argsort(-area, kind="stable"):
-        if area[number] < np.pi * (TOL.rounding * gsd) ** 2:
+    least = np.pi * (TOL.rounding * gsd) ** 2
+    openings = [
+        Opening(patch, border[is_body[border]], area)
+        for patch, border, area in _patches(mesh, seen & ~is_body, least)
+    ]
+    if upwards is not None:
+        is_top = mesh.face_normals @ upwards > np.cos(np.pi / 4)
+        openings += [
+            Opening(*top, is_supported=True)
+            for top in _patches(mesh, seen & is_top, _least_area(gsd))
+        ]
+    return SurfaceFaces(mesh.centers, mesh.face_normals, is_body, openings, scene.inside_along, gsd)
+
+
+def _patches(
+    mesh: TriangleMesh, chosen: Mask, least: float
+) -> Iterator[tuple[Indices, Indices, float]]:
+    """Faces, faces about them, and area of the connected patches of a least area, largest first."""
+    patches = mesh.pieces(chosen)
+    areas = np.bincount(patches + 1, mesh.face_areas)[1:]
+    for number in np.argsort(-areas, kind="stable"):
+        if areas[number] < least:
             break
         patch = np.flatnonzero(patches == number)
         touches = np.zeros(len(mesh.vertices), np.bool_)
         touches[mesh.faces[patch]] = True
-        border = np.flatnonzero(is_body & touches[mesh.faces].any(axis=1))
-        openings.append(Opening(patch, border, float(area[number])))
-    return SurfaceFaces(mesh.centers, mesh.face_normals, is_body, openings, scene.inside_along, gsd)
+        about = touches[mesh.faces].any(axis=1) & (patches != number)
+        yield patch, np.flatnonzero(about), float(areas[number])
 
 
 def find_cavities(
@@ -257,19 +284,18 @@ def find_cavities(
     found: list[Cavity] = []
     for opening in surface.openings:
         plane = _plane_of(opening, surface)
-        if plane is None:
-            continue
-        if any(_is_same(plane, other.rim, surface) for other in found):
+        middle = surface.centers[opening.patch].mean(axis=0)
+        if plane is None or any(other.is_below(middle) for other in found):
             continue
         enclosed = _is_enclosed(surface, opening, plane)
         top = _top_of_wall(surface, opening, plane) if enclosed else None
         cavity = None if top is None else _rounded_cavity(surface, opening, top, information)
         if cavity is not None and not _is_dark_inside(cavity, scene.maps):
             cavity = _likeliest_floor(cavity, gain)
-        if cavity is None:
+        if cavity is None and not opening.is_supported:
             cavity = _dark_cavity(surface, opening, plane, scene)
-        if cavity is None and top is not None:
-            cavity = _bright_cavity(surface, opening, top, gain)
+            if cavity is None and top is not None:
+                cavity = _bright_cavity(surface, opening, top, gain)
         if cavity is not None:
             found.append(cavity)
     return tuple(found)
@@ -586,12 +612,6 @@ def _surrounds(plane: Patch, border: Array, cap: Array) -> bool:
     return len(np.unique(_sectors(x, y))) >= TOL.min_sectors
 
 
-def _is_same(rim: Patch, other: Patch, surface: SurfaceFaces) -> bool:
-    """Whether two rims are of the same opening."""
-    near = np.abs(other.height(surface.centers[rim.members])) < SAME_PLANE_PX * surface.gsd
-    return bool(near.mean() > 0.5)
-
-
 def _grid_about(surface: SurfaceFaces, rim: Patch) -> PatchGrid:
     """A grid across the rim that holds all of the surface below it."""
     tangents = np.linalg.svd(rim.normal[None])[2][1:]
@@ -740,10 +760,15 @@ class _Wall:
         return known * (-self.outer - self.thickness) + (1 - known) * self.top
 
 
+def _inside_at(surface: SurfaceFaces, rim: Patch, grid: PatchGrid, depth: float) -> Mask:
+    """Cells (H, W) inside the surface at a depth of cells below a rim."""
+    origins, depths = grid.points(rim).reshape(-1, 3), np.array([depth * grid.step])
+    return surface.inside_along(origins, -rim.normal, depths).reshape(grid.shape)
+
+
 def _outside_at(surface: SurfaceFaces, rim: Patch, grid: PatchGrid, depth: float) -> Array:
     """Distance (H, W) in cells to the outer wall at a depth of cells, negative inside."""
-    origins, depths = grid.points(rim).reshape(-1, 3), np.array([depth * grid.step])
-    return _outside(surface.inside_along(origins, -rim.normal, depths).reshape(grid.shape))
+    return _outside(_inside_at(surface, rim, grid, depth))
 
 
 def _outside(inside: Mask) -> Array:
@@ -785,8 +810,10 @@ def _rounded_wall(
     The inner half of the rim faces the axis of the opening, which no cap does. So its phases also
     show that there is an opening. None if they do not. ``rim`` is the plane through its top.
     """
-    walls = _walls_about(opening, -_outside_at(surface, rim, grid, TOL.rounding), surface.gsd)
-    if not walls:
+    below = _inside_at(surface, rim, grid, TOL.rounding)
+    inwards = -_outside(below)
+    walls = _walls_about(inwards)
+    if not walls or _is_open(opening, below[inwards > walls[0]], grid.step):
         return None
     # Only below the radius the outside is that of the wall.
     starts = np.maximum(TOL.rounding, 0.5 * np.array(walls))
@@ -794,39 +821,55 @@ def _rounded_wall(
         grid.points(rim).reshape(-1, 3), -rim.normal, starts * grid.step
     ).reshape(-1, *grid.shape)
     middle = grid.cells(surface.centers[opening.patch].mean(axis=0))
-    tried, of_rims = [], []
-    for wall, inside in zip(walls, insides, strict=True):
-        found = _on_half_circle(wall, -_outside(inside), rim, grid, middle, information)
-        if found is not None:
-            tried.append(wall)
-            of_rims.append(found)
-    if not of_rims:
+    of_rims: dict[int, _RimInformation] = {}
+
+    def total(number: int) -> float:
+        """Information on the rim of a wall, if there is one."""
+        if number not in of_rims and 0 <= number < len(walls):
+            inwards = -_outside(insides[number])
+            found = _on_half_circle(walls[number], inwards, rim, grid, middle, information)
+            if found is not None:
+                of_rims[number] = found
+        return float(of_rims[number].of_views.sum()) if number in of_rims else -np.inf
+
+    best = max(range(0, len(walls), 2), key=total)
+    if not total(best) > 0:
         return None
-    best = int(np.argmax([found.of_views.sum() for found in of_rims]))
-    sectors = np.array([found.inner_of_sectors for found in of_rims])
-    if not _agree(of_rims[best].of_views) or not _agree(sectors[best]):
+    best = max((best - 1, best, best + 1), key=total)
+    numbers = sorted(of_rims)
+    sectors = np.array([of_rims[number].inner_of_sectors for number in numbers])
+    if not _agree(of_rims[best].of_views) or not _agree(of_rims[best].inner_of_sectors):
         return None
-    thickness = tried[best]
-    if 0 < best < len(tried) - 1:
-        beside = [found.of_views for found in of_rims[best - 1 : best + 2]]
+    thickness = walls[best]
+    if np.isfinite([total(best - 1), total(best + 1)]).all():
+        beside = [of_rims[number].of_views for number in (best - 1, best, best + 1)]
         thickness = float(thickness * RIM_RATIO ** _vertex(*beside)[0])
-    sigma = robust_deviation(np.array(tried)[sectors.argmax(axis=0)] - thickness)
+    tried = np.array(walls)[numbers]
+    sigma = robust_deviation(tried[sectors.argmax(axis=0)] - thickness)
     radius = 0.5 * thickness
     start = max(TOL.rounding, radius)
     outer = _outside_at(surface, rim, grid, start)
     return _Wall(rim, thickness, sigma, -outer - radius, outer, start, radius)
 
 
-def _walls_about(opening: Opening, inwards: Array, gsd: float) -> list[float]:
-    """Thicknesses of a wall, in GSD, that leave an opening which its cap fills.
+def _is_open(opening: Opening, solid: Mask, step: float) -> bool:
+    """Whether a surface is open already below a rim, ``solid`` or not in cells of the opening.
 
-    ``inwards`` (H, W) are distances from the outside of the wall, in cells of one GSD.
+    Phases show the inside then, unless they do not support most of it: such a cap may be sunk.
+    """
+    is_cap = not opening.is_supported and opening.area > 0.5 * len(solid) * step**2
+    return not is_cap and bool(solid.mean() < 0.5)
+
+
+def _walls_about(inwards: Array) -> list[float]:
+    """Thicknesses of a wall that leave an opening, in cells.
+
+    ``inwards`` (H, W) are distances from the outside of the wall, in cells.
     """
     tried: list[float] = []
     thickness = TOL.rounding * THICKNESS_RATIO**THINNEST
-    while (open_cells := np.count_nonzero(inwards > thickness)) > np.pi * TOL.rounding**2:
-        if opening.area > MIN_CAP * open_cells * gsd**2:
-            tried.append(thickness)
+    while np.count_nonzero(inwards > thickness) > np.pi * TOL.rounding**2:
+        tried.append(thickness)
         thickness *= RIM_RATIO
     return tried
 

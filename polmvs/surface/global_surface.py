@@ -622,7 +622,7 @@ def _carvings(
     if hull is None:
         return (), ()
     scene = RayScene(refined.mesh)
-    cavities = _cavities(given, refined, scene)
+    cavities = _cavities(given, refined, scene, first.plane)
     if first.walls is not None:
         return (), cavities
     cell = HullTolerances.step_px * first.gsd
@@ -648,8 +648,10 @@ def _free_of_points(first: _First, refined: Refined) -> tuple[TriangleMesh, Fit]
     return None if bias is None else (moved, free)
 
 
-def _cavities(given: _Given, refined: Refined, scene: RayScene) -> tuple[Cavity, ...]:
-    """Cavities behind the parts of a refined mesh that phases hardly support."""
+def _cavities(
+    given: _Given, refined: Refined, scene: RayScene, plane: SupportingPlane | None
+) -> tuple[Cavity, ...]:
+    """Cavities of a refined mesh, which stands on a plane if that is known."""
     mesh, fit = refined.mesh, refined.fit
     evidence = face_evidence(mesh, fit, label(mesh, fit))
     supported = supported_faces(
@@ -679,7 +681,8 @@ def _cavities(given: _Given, refined: Refined, scene: RayScene) -> tuple[Cavity,
     def of_faces(mesh: TriangleMesh) -> sparse.csr_array:
         return pixel_information(mesh, at_rims())
 
-    surface = surface_faces(scene, seen, supported, fit.gsd)
+    upwards = None if plane is None else plane.normal
+    surface = surface_faces(scene, seen, supported, fit.gsd, upwards)
     return find_cavities(surface, given.scene, gain, of_faces)
 
 

@@ -177,9 +177,16 @@ def predict(
     looking: Looking,
     *,
     outside: Mapping[str, Mask] = MappingProxyType({}),
+    measured: Mask | None = None,
     width_px: float = HeldOutTolerances.width_px,
 ) -> Prediction:
-    """Compare views with a mesh; parameters as of :func:`predict_left_out`."""
+    """Compare views with a mesh; other parameters as of :func:`predict_left_out`.
+
+    Parameters
+    ----------
+    measured : (F,) faces whose phases count: those in a cavity are not of its inferred walls.
+        None: all.
+    """
     scene = RayScene(mesh) if len(mesh.faces) else None
     common, either = 0, 0
     of_views: list[ViewError] = []
@@ -200,7 +207,7 @@ def predict(
         )
         common += int((shown & hit).sum())
         either += int((shown | (hit & ~possible)).sum())
-        seen = shown[hit]
+        seen = shown[hit] if measured is None else shown[hit] & measured[face]
         own_errors, own_sigmas = _phase_errors(
             mesh, view, image, looking, rays[hit][seen], face[seen], points[seen]
         )

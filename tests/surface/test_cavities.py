@@ -393,6 +393,99 @@ def test_a_sunk_lid_below_a_rim_is_where_phases_are_likeliest(gains, dark, depth
     assert (cavity.values(on_axis) > 0).tolist() == [True, False]
 
 
+def test_a_supported_cap_over_a_rim_is_an_opening():
+    """Phases of a mirror image agree with a cap, those of its rim do not."""
+    surface = closed_rounded_vessel()
+    (opening,) = surface.openings
+    top = replace(opening, is_supported=True)
+    surface = replace(surface, supported=np.ones(len(surface.centers), bool), openings=[top])
+    scene = patch_scene(vessel_maps(), AngleModel.PPA)
+
+    def gain(cavity):  # whatever the wall is: only the rim counts
+        return np.ones(8)
+
+    for wall, num in ((WALL, 1), (-WALL, 0)):
+        rim = on_rim_of(lambda angle, wall=wall: np.full_like(angle, wall))
+        found = find_cavities(surface, scene, gain, rim)
+        assert [cavity.thickness for cavity in found] == pytest.approx(num * [WALL], abs=GSD)
+
+
+def test_an_inside_that_phases_support_is_not_carved_deeper():
+    """A tray whose rim phases show; without support, its floor is a cap that has sunk."""
+    surface = closed_rounded_vessel()
+    (opening,) = surface.openings
+    bore, floor = RADIUS - WALL, HEIGHT - 16 * GSD
+
+    def inside_along(origins, direction, distances):
+        points = origins + distances[:, None, None] * direction
+        is_solid = np.hypot(points[..., 0], points[..., 1]) > bore
+        is_solid |= points[..., 2] < floor
+        return surface.inside_along(origins, direction, distances) & is_solid
+
+    scene = patch_scene(vessel_maps(dark=1.0), AngleModel.PPA)
+    rim = on_rim_of(lambda angle: np.full_like(angle, WALL))
+    for is_supported in (True, False):
+        openings = [replace(opening, is_supported=is_supported)]
+        tray = replace(surface, openings=openings, inside_along=inside_along)
+        found = find_cavities(tray, scene, lambda cavity: np.zeros(8), rim)
+        assert len(found) == (not is_supported)
+
+
+def test_an_opening_is_searched_once():
+    """A cap without support and the top with its rim are one opening; another beside it is not."""
+    surface = closed_rounded_vessel()
+    (opening,) = surface.openings
+    shift = np.array([4 * RADIUS, 0, 0])
+    num = len(surface.centers)
+
+    def inside_along(origins, direction, distances):
+        both = [surface.inside_along(origins - x, direction, distances) for x in (0 * shift, shift)]
+        return both[0] | both[1]
+
+    twins = replace(
+        surface,
+        centers=np.concatenate([surface.centers, surface.centers + shift]),
+        normals=np.tile(surface.normals, (2, 1)),
+        supported=np.tile(surface.supported, 2),
+        openings=[
+            opening,
+            replace(opening, is_supported=True),
+            replace(opening, patch=opening.patch + num, border=opening.border + num),
+        ],
+        inside_along=inside_along,
+    )
+    scene = patch_scene(vessel_maps(dark=1.0), AngleModel.PPA)
+
+    def rim(mesh):
+        near = mesh.centers[:, 0] < 2 * RADIUS
+        centred = mesh.moved(np.where(near[0], 0, -1) * shift)
+        return on_rim_of(lambda angle: np.full_like(angle, WALL))(centred)
+
+    found = find_cavities(twins, scene, lambda cavity: np.zeros(8), rim)
+    assert len(found) == 2
+    axes = np.array([[0, 0, 0.06], [4 * RADIUS, 0, 0.06]])
+    assert [(cavity.values(axes) > 0).tolist() for cavity in found] == [
+        [True, False],
+        [False, True],
+    ]
+
+
+def test_tops_of_a_standing_body_may_be_caps():
+    """A box whose faces are all supported."""
+    grid = np.ones((30, 30, 20), np.float32)
+    grid[2:-2, 2:-2, 2:-2] = -1
+    mesh = mesh_from_grid(grid, np.zeros(3), 1.0)
+    all_faces = np.ones(len(mesh.faces), bool)
+    scene = RayScene(mesh)
+    found = surface_faces(scene, all_faces, all_faces, 1.0, upwards=np.array([0, 0, 1.0]))
+    (top,) = found.openings
+    assert top.is_supported
+    assert (mesh.face_normals[top.patch, 2] > 0.7).all()
+    assert (mesh.face_normals[top.border, 2] < 0.72).all()
+    assert top.area == pytest.approx(26**2, rel=0.05)
+    assert surface_faces(scene, all_faces, all_faces, 1.0).openings == []
+
+
 def test_rims_deeper_than_a_shallow_body_are_not_asked_for():
     surface, asked = closed_rounded_vessel(), []
     below = HEIGHT - 8 * GSD

@@ -110,6 +110,20 @@ def test_phases_of_something_else_are_at_chance(views) -> None:
     assert chance.unexplained > 0.5
 
 
+def test_phases_of_inferred_faces_do_not_count(views) -> None:
+    """Half of an ellipsoid is replaced by a ball, as if it were inferred."""
+    mesh = extracted(ellipsoid, step=0.05)
+    is_right = mesh.centers[:, 0] > 0
+    bent = mesh.vertices.copy()
+    bent[bent[:, 0] < 0] *= [0.5, 1, 1]
+    bent = TriangleMesh(bent, mesh.faces)
+    every, some = (predict(bent, views, LOOKING, measured=m) for m in (None, is_right))
+    assert every.unexplained > 0.1
+    assert some.unexplained < 0.03
+    assert 0.3 * every.num_phases < some.num_phases < 0.7 * every.num_phases
+    assert some.overlap == every.overlap
+
+
 def test_one_inconsistent_view_is_named(views) -> None:
     """A view among those left out looks aside by 4 deg: it alone is predicted badly."""
     turn = Rotation.from_rotvec([0, 0.07, 0]).as_matrix()

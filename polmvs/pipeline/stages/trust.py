@@ -125,13 +125,13 @@ def _contradicted(
         seen, known = scene.views, scene.known
     mesh = TriangleMesh.of(read_mesh(views / SURFACE_MESH))
     kind = cloud.scalars["kind"][cKDTree(cloud.points).query(mesh.centers)[1]]
-    shown = np.flatnonzero(kind == PointKind.SURFACE)
-    wrong_camera = _camera_complaint(mesh, shown, seen, looking)
+    measured = kind != PointKind.INFERRED
+    wrong_camera = _camera_complaint(mesh, kind == PointKind.SURFACE, seen, looking)
     return replace(
         trust,
         complaints=(*trust.complaints, *(() if wrong_camera is None else (wrong_camera,))),
         predicted=predict_left_out(seen, plane, looking, known, scene=scene, outside=outside),
-        fitted=predict(mesh, seen, looking, outside=outside),
+        fitted=predict(mesh, seen, looking, outside=outside, measured=measured),
         # Of the last closed mesh: the surface has holes where nothing is known.
         soundness=find_soundness(
             TriangleMesh.of(read_mesh([views / SURFACE_MESH, *surface_levels(views)][-1])),
@@ -143,13 +143,13 @@ def _contradicted(
 
 def _camera_complaint(
     mesh: TriangleMesh,
-    shown: NDArray[np.int64],
+    shown: NDArray[np.bool_],
     views: Sequence[SurfaceView],
     looking: Looking,
 ) -> str | None:
     """Message about the given camera if it does not fit the phases of the surface.
 
-    ``shown`` are the faces whose phases count, without inferred ones.
+    ``shown`` (F,) are the faces whose phases count, without inferred ones.
     """
     camera = views[0].view.camera
     if looking.angle_model.formula is AngleModel.OPA or any(
@@ -157,8 +157,9 @@ def _camera_complaint(
     ):
         return None  # OPA has no rays, and cameras are checked together only if they are one
     images = [level_image(view, HeldOutTolerances.width_px) for view in views]
+    counted = np.flatnonzero(shown)
     some = TriangleMesh(
-        mesh.vertices, mesh.faces[shown[evenly_chosen(len(shown), MAX_CAMERA_POINTS)]]
+        mesh.vertices, mesh.faces[counted[evenly_chosen(len(counted), MAX_CAMERA_POINTS)]]
     )
     scene = RayScene(mesh)
     found = observe(some, scene, views, images, looking)
