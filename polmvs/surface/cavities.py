@@ -478,17 +478,17 @@ def _likeliest_floor(cavity: Cavity, gain: Gain) -> Cavity:
     A sunk lid is a floor below a rim as well. Light that was reflected several times biases the
     phases on the right walls, too, so only floors are compared.
     """
-    step = cavity.grid.step
+    step, at_bottom = cavity.grid.step, gain(cavity)
+    lowest = int(np.log2(cavity.depth / (TOL.rounding * step)))
+    if lowest < 1:
+        return cavity
 
     @cache
     def information(exponent: float) -> Array:
         depth = cavity.depth * 2.0**exponent
-        return gain(cavity.above(depth)) if depth > TOL.rounding * step else -np.inf * at_bottom
+        is_cavity = depth > TOL.rounding * step
+        return gain(cavity.above(depth)) if is_cavity else np.full_like(at_bottom, -np.inf)
 
-    at_bottom = gain(cavity)
-    lowest = int(np.log2(cavity.depth / (TOL.rounding * step)))
-    if lowest < 1:
-        return cavity
     best = float(max(range(-lowest, 0), key=lambda exponent: information(exponent).sum()))
     if not _agree(information(best) - at_bottom):
         return cavity

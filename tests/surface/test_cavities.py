@@ -373,23 +373,24 @@ def test_a_rim_whose_inner_half_phases_show_on_one_width_opens_into_a_cavity(swi
 
 
 @pytest.mark.parametrize(
-    ("gains", "dark", "depth"),
+    ("gains", "dark", "likeliest", "depth"),
     [
-        ([1.0] * 8, 1.0, 0.03),
-        ([9.0, 9, -1, -1, -1, -1, -1, -1], 1.0, HEIGHT - WALL),
-        ([1.0] * 8, 0.02, HEIGHT - WALL),
+        ([1.0] * 8, 1.0, 0.03, 0.03),
+        ([1.0] * 8, 1.0, 0.004, (CavityTolerances.rounding + 1) * GSD),
+        ([9.0, 9, -1, -1, -1, -1, -1, -1], 1.0, 0.03, HEIGHT - WALL),
+        ([1.0] * 8, 0.02, 0.03, HEIGHT - WALL),
     ],
-    ids=["a lid that all views show", "views that disagree", "a dark inside"],
+    ids=["a lid that all views show", "at the rim", "views that disagree", "a dark inside"],
 )
-def test_a_sunk_lid_below_a_rim_is_where_phases_are_likeliest(gains, dark, depth):
+def test_a_sunk_lid_below_a_rim_is_where_phases_are_likeliest(gains, dark, likeliest, depth):
     def gain(cavity):
-        return -np.array(gains) * np.log(cavity.depth / 0.03) ** 2
+        return -np.array(gains) * np.log(cavity.depth / likeliest) ** 2
 
     rim = on_rim_of(lambda angle: np.full_like(angle, WALL))
     scene = patch_scene(vessel_maps(dark=dark), AngleModel.PPA)
     (cavity,) = find_cavities(closed_rounded_vessel(), scene, gain, rim)
     assert cavity.depth == pytest.approx(depth, abs=3 * GSD)
-    on_axis = np.array([[0, 0, HEIGHT - depth + 4 * GSD], [0, 0, HEIGHT - depth - 4 * GSD]])
+    on_axis = np.array([[0, 0, HEIGHT - depth + GSD], [0, 0, HEIGHT - depth - GSD]])
     assert (cavity.values(on_axis) > 0).tolist() == [True, False]
 
 
