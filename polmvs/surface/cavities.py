@@ -292,6 +292,8 @@ def find_cavities(
         cavity = None if top is None else _rounded_cavity(surface, opening, top, information)
         if cavity is not None and not _is_dark_inside(cavity, scene.maps):
             cavity = _likeliest_floor(cavity, gain)
+            if opening.is_supported and not _agree(gain(cavity)):  # such as a lid at its rim
+                cavity = None
         if cavity is None and not opening.is_supported:
             cavity = _dark_cavity(surface, opening, plane, scene)
             if cavity is None and top is not None:

@@ -394,21 +394,24 @@ def test_a_sunk_lid_below_a_rim_is_where_phases_are_likeliest(gains, dark, likel
     assert (cavity.values(on_axis) > 0).tolist() == [True, False]
 
 
-def test_a_supported_cap_over_a_rim_is_an_opening():
-    """Phases of a mirror image agree with a cap, those of its rim do not."""
+@pytest.mark.parametrize(
+    ("wall", "dark", "gain", "num"),
+    [(WALL, 0.02, -1.0, 1), (-WALL, 0.02, -1.0, 0), (WALL, 1.0, -1.0, 0), (WALL, 1.0, 1.0, 1)],
+    ids=["dark", "no rim", "a bright lid", "a bright inside"],
+)
+def test_a_supported_cap_over_a_rim_is_an_opening(wall, dark, gain, num):
+    """Phases of a mirror image agree with a cap, those of its rim do not.
+
+    The light of a mirror image is weak; under a bright opening the inside must be likelier.
+    """
     surface = closed_rounded_vessel()
     (opening,) = surface.openings
     top = replace(opening, is_supported=True)
     surface = replace(surface, supported=np.ones(len(surface.centers), bool), openings=[top])
-    scene = patch_scene(vessel_maps(), AngleModel.PPA)
-
-    def gain(cavity):  # whatever the wall is: only the rim counts
-        return np.ones(8)
-
-    for wall, num in ((WALL, 1), (-WALL, 0)):
-        rim = on_rim_of(lambda angle, wall=wall: np.full_like(angle, wall))
-        found = find_cavities(surface, scene, gain, rim)
-        assert [cavity.thickness for cavity in found] == pytest.approx(num * [WALL], abs=GSD)
+    scene = patch_scene(vessel_maps(dark=dark), AngleModel.PPA)
+    rim = on_rim_of(lambda angle: np.full_like(angle, wall))
+    found = find_cavities(surface, scene, lambda cavity: np.full(8, gain), rim)
+    assert [cavity.thickness for cavity in found] == pytest.approx(num * [WALL], abs=GSD)
 
 
 def test_an_inside_that_phases_support_is_not_carved_deeper():
