@@ -135,8 +135,13 @@ class Cavity:
     @property
     def is_deep(self) -> bool:
         """Whether it is deeper than wide: light in it was reflected several times."""
-        area = np.count_nonzero(self.field[-self.first_layer] > 0) * self.grid.step**2
+        area = np.count_nonzero(self.open_cells) * self.grid.step**2
         return bool(self.depth > 2 * np.sqrt(area / np.pi))
+
+    @property
+    def open_cells(self) -> Mask:
+        """(H, W) bool, its opening at the height of the rim."""
+        return np.asarray(self.field[-self.first_layer] > 0)
 
     @property
     def depths(self) -> Array:
@@ -290,7 +295,9 @@ def find_cavities(
         enclosed = _is_enclosed(surface, opening, plane)
         top = _top_of_wall(surface, opening, plane) if enclosed else None
         cavity = None if top is None else _rounded_cavity(surface, opening, top, information)
-        if cavity is not None and not _is_dark_inside(cavity, scene.maps):
+        if cavity is not None and not _is_dark_opening(
+            cavity.open_cells, cavity.rim, cavity.grid, scene.maps
+        ):
             cavity = _likeliest_floor(cavity, gain)
             if opening.is_supported and not _agree(gain(cavity)):  # such as a lid at its rim
                 cavity = None
@@ -690,11 +697,12 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap]) -> bool:
     return bool(len(dark) and dark.mean() > 0.5)
 
 
-def _is_dark_inside(cavity: Cavity, maps: Sequence[PhaseMap]) -> bool:
-    """Whether the opening of a cavity is much darker than its rim."""
-    open_cells = np.asarray(cavity.field[-cavity.first_layer] > 0)
+def _is_dark_opening(
+    open_cells: Mask, rim: Patch, grid: PatchGrid, maps: Sequence[PhaseMap]
+) -> bool:
+    """Whether an opening, of cells (H, W), is much darker than its rim."""
     inner = ndimage.binary_erosion(open_cells, iterations=3)
-    places = cavity.grid.points(cavity.rim)
+    places = grid.points(rim)
     return _is_dark(places[inner], places[_ring_about(open_cells)], maps)
 
 
@@ -762,15 +770,16 @@ class _Wall:
         return known * (-self.outer - self.thickness) + (1 - known) * self.top
 
 
-def _inside_at(surface: SurfaceFaces, rim: Patch, grid: PatchGrid, depth: float) -> Mask:
-    """Cells (H, W) inside the surface at a depth of cells below a rim."""
-    origins, depths = grid.points(rim).reshape(-1, 3), np.array([depth * grid.step])
-    return surface.inside_along(origins, -rim.normal, depths).reshape(grid.shape)
+def _inside_at(surface: SurfaceFaces, rim: Patch, grid: PatchGrid, depths: Array) -> Mask:
+    """Cells (D, H, W) inside the surface at depths (D,) of cells below a rim."""
+    origins = grid.points(rim).reshape(-1, 3)
+    inside = surface.inside_along(origins, -rim.normal, depths * grid.step)
+    return inside.reshape(-1, *grid.shape)
 
 
 def _outside_at(surface: SurfaceFaces, rim: Patch, grid: PatchGrid, depth: float) -> Array:
     """Distance (H, W) in cells to the outer wall at a depth of cells, negative inside."""
-    return _outside(_inside_at(surface, rim, grid, depth))
+    return _outside(_inside_at(surface, rim, grid, np.array([depth]))[0])
 
 
 def _outside(inside: Mask) -> Array:
@@ -788,9 +797,7 @@ def _flat_wall(
     """The wall under a flat rim: as thick as the rim is wide. None without a dark opening in it."""
     rim = _in_focus(rim, grid, scene, surface.gsd)
     open_cells = _open_cells(rim, surface.centers[rim.members], grid, scene)
-    inner = ndimage.binary_erosion(open_cells, iterations=3)
-    places = grid.points(rim)
-    if not _is_dark(places[inner], places[_ring_about(open_cells)], scene.maps):
+    if not _is_dark_opening(open_cells, rim, grid, scene.maps):
         return None
     beside = border_of_steps(open_cells, open_cells, rim, grid, scene)
     outer = _outside_at(surface, rim, grid, TOL.rounding)
@@ -812,16 +819,14 @@ def _rounded_wall(
     The inner half of the rim faces the axis of the opening, which no cap does. So its phases also
     show that there is an opening. None if they do not. ``rim`` is the plane through its top.
     """
-    below = _inside_at(surface, rim, grid, TOL.rounding)
+    (below,) = _inside_at(surface, rim, grid, np.array([TOL.rounding]))
     inwards = -_outside(below)
     walls = _walls_about(inwards)
     if not walls or _is_open(opening, below[inwards > walls[0]], grid.step):
         return None
     # Only below the radius the outside is that of the wall.
     starts = np.maximum(TOL.rounding, 0.5 * np.array(walls))
-    insides = surface.inside_along(
-        grid.points(rim).reshape(-1, 3), -rim.normal, starts * grid.step
-    ).reshape(-1, *grid.shape)
+    insides = _inside_at(surface, rim, grid, starts)
     middle = grid.cells(surface.centers[opening.patch].mean(axis=0))
     of_rims: dict[int, _RimInformation] = {}
 
@@ -855,9 +860,9 @@ def _rounded_wall(
 
 
 def _is_open(opening: Opening, solid: Mask, step: float) -> bool:
-    """Whether a surface is open already below a rim, ``solid`` or not in cells of the opening.
+    """Whether a surface has an inside below a rim, where ``solid`` (N,) are cells of the opening.
 
-    Phases show the inside then, unless they do not support most of it: such a cap may be sunk.
+    A cap that phases hardly support may have sunk below the rim: it is no inside.
     """
     is_cap = not opening.is_supported and opening.area > 0.5 * len(solid) * step**2
     return not is_cap and bool(solid.mean() < 0.5)
@@ -943,9 +948,7 @@ def _cavity(surface: SurfaceFaces, wall: _Wall, grid: PatchGrid, opening: Openin
     lowest = -float(rim.height(surface.centers[surface.supported]).min()) / grid.step
     spacing = max(0.5 * TOL.rounding, lowest / most)
     depths = spacing * np.arange(1, int(np.ceil(lowest / spacing)) + 2, dtype=np.float64)
-    insides = surface.inside_along(
-        grid.points(rim).reshape(-1, 3), -rim.normal, depths * grid.step
-    ).reshape(-1, *grid.shape)
+    insides = _inside_at(surface, rim, grid, depths)
     layers = [wall.top]
     for depth, inside in zip(depths, insides, strict=True):
         if not inside.any():

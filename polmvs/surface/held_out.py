@@ -184,7 +184,7 @@ def predict(
 
     Parameters
     ----------
-    measured : (F,) faces whose phases count: those in a cavity are not of its inferred walls.
+    measured : (F,) faces whose phases count; light in a cavity does not show its inferred walls.
         None: all.
     """
     scene = RayScene(mesh) if len(mesh.faces) else None

@@ -223,12 +223,14 @@ class RayScene:
     def _local(self, points: Floats) -> NDArray[np.float32]:
         return np.ascontiguousarray(points - self._origin, np.float32)
 
+    def _rays(self, origins: Floats, directions: Floats) -> Any:
+        rays = np.empty((len(directions), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = self._local(origins), directions
+        return self._tensor(rays)
+
     def cast(self, origins: Floats, directions: Floats) -> RayHits:
         """First hits of rays from ``origins`` (3,) or (N, 3) along ``directions`` (N, 3)."""
-        rays = np.empty((len(directions), 6), np.float32)
-        rays[:, :3] = self._local(origins)
-        rays[:, 3:] = directions
-        hits = self._scene.cast_rays(self._tensor(rays))
+        hits = self._scene.cast_rays(self._rays(origins, directions))
         distance = hits["t_hit"].numpy()
         face = hits["primitive_ids"].numpy().astype(np.int64)
         uv = hits["primitive_uvs"].numpy()
@@ -239,9 +241,8 @@ class RayScene:
         """Which segments ``(N, 3)`` from an ``origin`` (3,) meet the mesh: faster than rays."""
         if not len(segments):  # Open3D crashes on none
             return np.zeros(0, np.bool_)
-        rays = np.empty((len(segments), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = self._local(origin), segments
-        return np.asarray(self._scene.test_occlusions(self._tensor(rays), tfar=1.0).numpy())
+        rays = self._rays(origin, segments)
+        return np.asarray(self._scene.test_occlusions(rays, tfar=1.0).numpy())
 
     def closest(self, points: Floats) -> tuple[Array, NDArray[np.int64], NDArray[np.float32]]:
         """Closest points ``(N, 3)``, their faces ``(N,)`` and barycentrics ``(N, 3)``."""
@@ -316,9 +317,7 @@ class RayScene:
 
     def crossings(self, origins: Floats, directions: Floats) -> Crossings:
         """All crossings of rays from ``origins`` (3,) or (N, 3) along ``directions`` (N, 3)."""
-        rays = np.empty((len(directions), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = self._local(origins), directions
-        found = self._scene.list_intersections(self._tensor(rays))
+        found = self._scene.list_intersections(self._rays(origins, directions))
         ray = found["ray_ids"].numpy().astype(np.int64)
         length = found["t_hit"].numpy()
         order = np.lexsort((length, ray))
