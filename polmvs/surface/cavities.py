@@ -29,7 +29,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
+from scipy import ndimage, sparse, special
 
 from polmvs.camera import in_frame, sample_image
 from polmvs.fitting import robust_deviation
@@ -54,7 +54,7 @@ from polmvs.surface.offsets import (
     row_losses,
     snapped_border,
 )
-from polmvs.surface.surface_quality import ONE_SIDED
+from polmvs.surface.surface_quality import SIGNIFICANCE
 from polmvs.surface.visual_hull import HullTolerances, SupportingPlane
 
 Array = NDArray[np.float64]
@@ -68,7 +68,7 @@ MIN_BORDER = 10  # least number of faces of a rim, and of the border of an openi
 THICKNESS_RATIO = 1.25  # of neighbours among the thicknesses that are tried
 THINNEST = -2  # exponent of the ratio, over the width of the rounding: about two cells of the mesh
 NUM_SECTORS = 8  # around an opening
-RIM_CELLS = 8  # across a rounded rim, whose normals turn by 180 deg
+RIM_CELLS = 8  # across a rounded rim, whose normals turn by 180 deg; half as many to find it
 RIM_RATIO = 1.08  # as 1.25, of a rounded rim: its phases contradict a tenth more or less
 TOP_SECTORS = 36  # in each of which the top of a wall is sought
 PLANE_ROUNDS = 3  # of the fit of a plane to half of a border
@@ -499,7 +499,7 @@ def _likeliest_floor(cavity: Cavity, gain: Gain) -> Cavity:
         return gain(cavity.above(depth)) if is_cavity else np.full_like(at_bottom, -np.inf)
 
     best = float(max(range(-lowest, 0), key=lambda exponent: information(exponent).sum()))
-    if not _agree(information(best) - at_bottom):
+    if not _agree(information(best) - at_bottom, best_of=lowest):
         return cavity
     halving = 0.5
     while cavity.depth * (2.0 ** (best + halving) - 2.0**best) > step:
@@ -536,9 +536,13 @@ def _top_of_wall(surface: SurfaceFaces, opening: Opening, plane: Patch) -> Patch
     return plane
 
 
-def _agree(gain: Array) -> bool:
-    """Whether gains (N,) have a positive mean at a significance of 95 %."""
-    return bool(gain.mean() > ONE_SIDED * _sigma_of_mean(gain))
+def _agree(gain: Array, best_of: int = 1) -> bool:
+    """Whether gains (N,), the best of some tried, have a positive mean at a significance of 95 %.
+
+    The more are tried, the more likely is one by chance (Sidak 1967).
+    """
+    deviations = float(special.ndtri(SIGNIFICANCE ** (1 / best_of)))
+    return bool(gain.mean() > deviations * _sigma_of_mean(gain))
 
 
 def _sigma_of_mean(values: Array) -> float:
@@ -826,33 +830,38 @@ def _rounded_wall(
         return None
     # Only below the radius the outside is that of the wall.
     starts = np.maximum(TOL.rounding, 0.5 * np.array(walls))
-    insides = _inside_at(surface, rim, grid, starts)
+    different, which = np.unique(starts, return_inverse=True)
+    insides = _inside_at(surface, rim, grid, different)
+    outsides = cache(lambda number: _outside(insides[number]))
     middle = grid.cells(surface.centers[opening.patch].mean(axis=0))
-    of_rims: dict[int, _RimInformation] = {}
 
-    def total(number: int) -> float:
-        """Information on the rim of a wall, if there is one."""
-        if number not in of_rims and 0 <= number < len(walls):
-            inwards = -_outside(insides[number])
-            found = _on_half_circle(walls[number], inwards, rim, grid, middle, information)
-            if found is not None:
-                of_rims[number] = found
-        return float(of_rims[number].of_views.sum()) if number in of_rims else -np.inf
+    @cache
+    def at_rim(number: int, num_cells: int = RIM_CELLS) -> _RimInformation | None:
+        if not 0 <= number < len(walls):
+            return None
+        inwards = -outsides(int(which[number]))
+        return _on_half_circle(walls[number], num_cells, inwards, rim, grid, middle, information)
 
-    best = max(range(0, len(walls), 2), key=total)
+    def total(number: int, *num_cells: int) -> float:
+        found = at_rim(number, *num_cells)
+        return -np.inf if found is None else float(found.of_views.sum())
+
+    some = range(0, len(walls), 2)
+    best = max(some, key=lambda number: total(number, RIM_CELLS // 2))
     if not total(best) > 0:
         return None
     best = max((best - 1, best, best + 1), key=total)
-    numbers = sorted(of_rims)
-    sectors = np.array([of_rims[number].inner_of_sectors for number in numbers])
-    if not _agree(of_rims[best].of_views) or not _agree(of_rims[best].inner_of_sectors):
+    found = at_rim(best)
+    if found is None or not _agree(found.of_views) or not _agree(found.inner_of_sectors):
         return None
+    near = (best - 1, best, best + 1)
+    tried = {number: one for number in sorted({*some, *near}) if (one := at_rim(number))}
     thickness = walls[best]
-    if np.isfinite([total(best - 1), total(best + 1)]).all():
-        beside = [of_rims[number].of_views for number in (best - 1, best, best + 1)]
+    beside = [tried[number].of_views for number in near if number in tried]
+    if len(beside) == 3:
         thickness = float(thickness * RIM_RATIO ** _vertex(*beside)[0])
-    tried = np.array(walls)[numbers]
-    sigma = robust_deviation(tried[sectors.argmax(axis=0)] - thickness)
+    likeliest = np.argmax([one.inner_of_sectors for one in tried.values()], axis=0)
+    sigma = robust_deviation(np.array(walls)[list(tried)][likeliest] - thickness)
     radius = 0.5 * thickness
     start = max(TOL.rounding, radius)
     outer = _outside_at(surface, rim, grid, start)
@@ -897,6 +906,7 @@ class _RimInformation:
 
 def _on_half_circle(
     thickness: float,
+    num_cells: int,
     inwards: Array,
     rim: Patch,
     grid: PatchGrid,
@@ -908,12 +918,13 @@ def _on_half_circle(
     Parameters
     ----------
     thickness : of the wall, in cells.
+    num_cells : across it, for the half circle.
     inwards : (H, W) distance from the outside of the wall, in cells.
     rim, grid : plane through the top of the wall, and the grid across it.
     middle : (2,), cell in the opening.
     information : (V, F) of each view's phases on the faces of a mesh.
     """
-    radius, fine = 0.5 * thickness, grid.at_step(thickness * grid.step / RIM_CELLS)
+    radius, fine = 0.5 * thickness, grid.at_step(thickness * grid.step / num_cells)
     places = np.indices(fine.shape) * (fine.step / grid.step)
     smooth = ndimage.gaussian_filter(inwards, 1.0, mode="nearest")
     inwards = ndimage.map_coordinates(smooth, places, order=1, mode="nearest")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from itertools import compress
 from pathlib import Path
 
@@ -38,6 +38,8 @@ from polmvs.surface.creases import (
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
 from polmvs.surface.mesh_geometry import (
+    Box,
+    DistanceGrid,
     RayScene,
     SignedDistance,
     TriangleMesh,
@@ -663,16 +665,25 @@ def _cavities(
     )
     seen = evidence.num_views >= given.min_views
 
-    def information(step: float, *free: SignedDistance) -> Array:
-        """Of the phases of each view, nats, on the mesh with free space carved."""
-        return view_information(remeshed(scene, step, free=free, smoothing=0), fit)
+    @lru_cache(1)
+    def parts_at(step: float, box: Box) -> tuple[DistanceGrid, TriangleMesh]:
+        """The part of the surface in a box, on a grid, and the rest."""
+        low, high = np.array(box)
+        within = ((mesh.centers >= low) & (mesh.centers <= high)).all(axis=1)
+        return DistanceGrid.of(scene, step, box), TriangleMesh(mesh.vertices, mesh.faces[~within])
+
+    def information(step: float, box: Box, *free: SignedDistance) -> Array:
+        """Of the phases of each view on a part, nats, with free space carved."""
+        part, rest = parts_at(step, box)
+        return view_information(part.mesh(free=free, smoothing=0), fit, rest)
 
     closed = cache(information)
 
     def gain(cavity: Cavity) -> Array:
         # With fewer than two cells across it, a wall vanishes.
         step = min(HullTolerances.step_px * fit.gsd, 0.5 * cavity.thickness)
-        return information(step, cavity.values) - closed(step)
+        box = cavity.grid.box_of(mesh.centers)
+        return information(step, box, cavity.values) - closed(step, box)
 
     @cache
     def at_rims() -> Fit:

@@ -26,6 +26,8 @@ Faces = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 # Of points (N, 3): (N,), negative in solid, positive in free space.
 SignedDistance: TypeAlias = Callable[[Array], Floats]
+# Lowest and highest corner along the axes of the world.
+Box: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 
 # Directions of rays whose majority decides inside or outside, as one may graze an edge; not axes.
 SIGN_DIRECTIONS = (
@@ -34,6 +36,7 @@ SIGN_DIRECTIONS = (
     np.array([0.25, -0.83, -0.50]),
 )
 LINE_OFFSET = np.array([1e-3, 7e-4])  # of rays beside lines of a grid, in its steps
+MIN_CELLS = 30  # least number inside a piece of a mesh
 MAX_CELLS = 6_000_000  # of a grid: 4 bytes each for a few arrays. From the memory allowed
 BAND_CELLS = 3  # half width of the band about a mesh in which distances are computed
 
@@ -55,6 +58,13 @@ class TriangleMesh:
     def of(cls, mesh: Mesh) -> TriangleMesh:
         """The triangles of a mesh of a file."""
         return cls(mesh.vertices, mesh.triangles.astype(np.int64))
+
+    def with_faces_of(self, other: TriangleMesh) -> TriangleMesh:
+        """Both meshes in one, not joined."""
+        vertices = np.concatenate([self.vertices, other.vertices])
+        return TriangleMesh(
+            vertices, np.concatenate([self.faces, other.faces + len(self.vertices)])
+        )
 
     @cached_property
     def corners(self) -> Array:
@@ -491,6 +501,64 @@ def thickened(scene: RayScene, coarse: RayScene, edge: float) -> TriangleMesh:
     return mesh.moved(-0.5 * missing[:, None] * inwards)
 
 
+@dataclass(frozen=True)
+class DistanceGrid:
+    """Signed distance to a closed mesh on a grid, from which meshes with free space are made.
+
+    Attributes
+    ----------
+    values : (X, Y, Z) float32, clipped to ``BAND_CELLS`` steps, negative inside.
+    origin : (3,), place of ``values[0, 0, 0]``.
+    step : of the grid, world units.
+    """
+
+    values: NDArray[np.float32]
+    origin: Array
+    step: float
+
+    @classmethod
+    def of(cls, scene: RayScene, step: float, box: Box | None = None) -> DistanceGrid:
+        """The grid about the mesh of a scene, or about its part in a box."""
+        vertices = scene.mesh.vertices
+        if not len(vertices):
+            return cls(np.ones((1, 1, 1), np.float32), np.zeros(3), step)
+        low, high = (
+            (vertices.min(axis=0), vertices.max(axis=0)) if box is None else map(np.array, box)
+        )
+        origin = low - (BAND_CELLS + 1) * step
+        shape = tuple(int(n) for n in np.ceil((high - low) / step) + 2 * BAND_CELLS + 3)
+        return cls(_signed_distances(scene, origin, step, shape), origin, step)
+
+    def mesh(
+        self,
+        *,
+        solid: Sequence[SignedDistance] = (),
+        free: Sequence[SignedDistance] = (),
+        smoothing: float = 0.5,
+    ) -> TriangleMesh:
+        """The mesh of the grid's surface; see :func:`remeshed`."""
+        origin, step, shape = self.origin, self.step, self.values.shape
+        limit = np.float32(BAND_CELLS * step)
+        values = (
+            ndimage.gaussian_filter(self.values, smoothing) if smoothing else self.values.copy()
+        )
+        if solid:
+            rest = np.stack(np.meshgrid(*map(np.arange, shape[1:]), indexing="ij"), axis=-1)
+            for number, slab in enumerate(values):  # to bound the memory
+                cells = np.concatenate([np.full((*shape[1:], 1), number), rest], axis=-1)
+                points = origin + step * cells.reshape(-1, 3)
+                for function in solid:
+                    distances = np.clip(function(points), -limit, limit).reshape(slab.shape)
+                    np.minimum(slab, distances, out=slab)
+        if free:
+            inner = values < limit
+            points = origin + step * np.argwhere(inner)
+            for function in free:
+                values[inner] = np.maximum(values[inner], np.minimum(function(points), limit))
+        _drop_small(values, limit)
+        return relaxed(mesh_from_grid(values, origin, step))
+
+
 def remeshed(
     scene: RayScene,
     step: float,
@@ -498,12 +566,11 @@ def remeshed(
     solid: Sequence[SignedDistance] = (),
     free: Sequence[SignedDistance] = (),
     smoothing: float = 0.5,
-    min_cells: int = 30,
 ) -> TriangleMesh:
     """The mesh of a scene, with edges of about ``step`` from its signed distance on a grid.
 
     The new mesh does not intersect itself; touching pieces are joined, and pieces that enclose
-    fewer than ``min_cells`` cells are removed.
+    fewer than ``MIN_CELLS`` cells are removed.
 
     Parameters
     ----------
@@ -515,32 +582,9 @@ def remeshed(
         space to carve; its borders are not smoothed.
     smoothing : width of a Gaussian on the distances, in steps.
     """
-    mesh = scene.mesh
-    if not len(mesh.faces):
-        return mesh
-    origin = mesh.vertices.min(axis=0) - (BAND_CELLS + 1) * step
-    shape = tuple(
-        int(n) for n in np.ceil((np.ptp(mesh.vertices, axis=0)) / step) + 2 * BAND_CELLS + 3
-    )
-    limit = np.float32(BAND_CELLS * step)
-    values = _signed_distances(scene, origin, step, shape)
-    if smoothing > 0:
-        values = ndimage.gaussian_filter(values, smoothing)
-    if solid:
-        rest = np.stack(np.meshgrid(*map(np.arange, shape[1:]), indexing="ij"), axis=-1)
-        for number, slab in enumerate(values):  # to bound the memory
-            cells = np.concatenate([np.full((*shape[1:], 1), number), rest], axis=-1)
-            points = origin + step * cells.reshape(-1, 3)
-            for function in solid:
-                distances = np.clip(function(points), -limit, limit).reshape(slab.shape)
-                np.minimum(slab, distances, out=slab)
-    if free:
-        inner = values < limit
-        points = origin + step * np.argwhere(inner)
-        for function in free:
-            values[inner] = np.maximum(values[inner], np.minimum(function(points), limit))
-    _drop_small(values, min_cells, limit)
-    return relaxed(mesh_from_grid(values, origin, step))
+    if not len(scene.mesh.faces):
+        return scene.mesh
+    return DistanceGrid.of(scene, step).mesh(solid=solid, free=free, smoothing=smoothing)
 
 
 def _signed_distances(
@@ -582,8 +626,12 @@ def _band_about(mesh: TriangleMesh, origin: Array, step: float, shape: tuple[int
     """Grid points within about ``BAND_CELLS`` steps of a mesh."""
     band = np.zeros(shape, np.bool_)
     num = int(np.ceil(1 + 2 * mesh.mean_edge / step))
+    cells = (mesh.corners - origin) / step
+    near = ((cells.max(axis=1) > -0.5) & (cells.min(axis=1) < np.array(shape) - 0.5)).all(axis=1)
+    cells = cells[near]
     for weights in _simplex_lattice(num):
-        place = np.rint((np.tensordot(weights, mesh.corners, (0, 1)) - origin) / step)
+        place = np.rint(np.tensordot(weights, cells, (0, 1)))
+        place = place[((place >= 0) & (place < shape)).all(axis=1)]
         band[tuple(place.astype(np.int64).T)] = True
     return np.asarray(ndimage.binary_dilation(band, iterations=BAND_CELLS))
 
@@ -603,11 +651,11 @@ def _impossible_signs(values: NDArray[np.float32], step: float) -> Mask:
     return doubtful
 
 
-def _drop_small(values: NDArray[np.float32], min_cells: int, outside: np.float32) -> None:
-    """Fill inside pieces of fewer than ``min_cells`` grid points with ``outside``, in place."""
+def _drop_small(values: NDArray[np.float32], outside: np.float32) -> None:
+    """Fill inside pieces of fewer than ``MIN_CELLS`` grid points with ``outside``, in place."""
     labels, num = ndimage.label(values < 0)
     if num > 1:
-        small = np.bincount(labels.ravel()) < min_cells
+        small = np.bincount(labels.ravel()) < MIN_CELLS
         small[0] = False
         values[small[labels]] = outside
 

@@ -44,7 +44,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
 from polmvs.surface.borders import drawn_border, smoothly_beside
 from polmvs.surface.creases import CreaseTolerances
-from polmvs.surface.mesh_geometry import RayScene, SignedDistance, visible_points
+from polmvs.surface.mesh_geometry import Box, RayScene, SignedDistance, visible_points
 from polmvs.surface.silhouettes import SilhouetteTolerances, nearest_steps, step_slope
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX
 from polmvs.surface.terms import TermTolerances
@@ -174,6 +174,11 @@ class PatchGrid:
         """Row and column ``(..., 2)`` of points ``(..., 3)``, fractional."""
         local = np.asarray(points, np.float64) - self.origin
         return np.stack([local @ self.first, local @ self.second], axis=-1) / self.step
+
+    def box_of(self, points: Array) -> Box:
+        """The box about those of points ``(N, 3)`` that lie above or below the cells."""
+        own = points[in_frame(self.cells(points), *np.array(self.shape) - 1)]
+        return tuple(own.min(axis=0).tolist()), tuple(own.max(axis=0).tolist())
 
     def points(self, patch: Patch) -> Array:
         """Points ``(H, W, 3)`` of a patch over all cells."""

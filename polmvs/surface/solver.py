@@ -718,25 +718,6 @@ class Labelled:
         variances = self.observations.variances(mesh.face_normals, self.row_sigma)
         return residuals[kind, index], variances[kind, index]
 
-    def information(self, mesh: TriangleMesh, fit: Fit) -> Array:
-        """Log-likelihood (K,) of the phases under the mesh's normals, over that of any phase, nats.
-
-        The light is unknown. Phases that are noisy, or seen frontally, say little; phases that
-        contradict the normal have a negative value.
-        """
-        o = self.observations
-        sine2 = np.maximum(1 - dots(o.rays, mesh.face_normals.take(o.face, axis=0)) ** 2, 1e-6)
-        turn = np.arcsin(np.clip(o.residuals(mesh.face_normals) / np.sqrt(sine2), -1, 1))
-        variance = o.variances(mesh.face_normals, self.row_sigma) / sine2
-        # Phases repeat after pi. Above a deviation of pi/2 all are alike within 1.5 %.
-        variance = np.minimum(variance, (np.pi / 2) ** 2)
-        periods = np.array([-np.pi, 0, np.pi])[:, None, None]
-        density = np.exp(-0.5 * (turn + periods) ** 2 / variance).sum(axis=0)
-        density /= np.sqrt(2 * np.pi * variance)
-        either = np.einsum("l,lk->k", fit.looking.light_weights, density)
-        other = fit.tol.labels.outlier  # share of neither light
-        return np.asarray(np.log((1 - other) * np.pi * either + other))
-
     def contradicts(self, mesh: TriangleMesh) -> Mask:
         """(K,) bool, residuals beyond noise and beyond the difference between sides of a crease."""
         residual, variance = self.residuals(mesh)
@@ -757,6 +738,25 @@ class Labelled:
         count = np.maximum(np.bincount(face, minlength=num_faces), 1)
         values = (*self.shares, self.observations.dolp)
         return np.stack([np.bincount(face, value, num_faces) / count for value in values])
+
+
+def phase_information(mesh: TriangleMesh, seen: Observations, fit: Fit) -> Array:
+    """Log-likelihood (K,) of the phases under the mesh's normals, over that of any phase, nats.
+
+    The light is unknown. Phases that are noisy, or seen frontally, say little; phases that
+    contradict the normal have a negative value.
+    """
+    sine2 = np.maximum(1 - dots(seen.rays, mesh.face_normals.take(seen.face, axis=0)) ** 2, 1e-6)
+    turn = np.arcsin(np.clip(seen.residuals(mesh.face_normals) / np.sqrt(sine2), -1, 1))
+    variance = seen.variances(mesh.face_normals, fit.scales.of(seen)) / sine2
+    # Phases repeat after pi. Above a deviation of pi/2 all are alike within 1.5 %.
+    variance = np.minimum(variance, (np.pi / 2) ** 2)
+    periods = np.array([-np.pi, 0, np.pi])[:, None, None]
+    density = np.exp(-0.5 * (turn + periods) ** 2 / variance).sum(axis=0)
+    density /= np.sqrt(2 * np.pi * variance)
+    either = np.einsum("l,lk->k", fit.looking.light_weights, density)
+    other = fit.tol.labels.outlier  # share of neither light
+    return np.asarray(np.log((1 - other) * np.pi * either + other))
 
 
 def label(mesh: TriangleMesh, fit: Fit, *, min_cosine: float | None = None) -> Labelled:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
+from scipy import ndimage, sparse, special
 
 from polmvs.camera import sample_image
 from polmvs.fitting import like_most, robust_deviation
@@ -25,7 +25,8 @@ from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS
 from polmvs.surface.creases import CreaseTolerances, SideAverage
 from polmvs.surface.dense_view import lattice_xy
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
-from polmvs.surface.solver import Fit, Labelled, covered_share, label
+from polmvs.surface.observations import observe
+from polmvs.surface.solver import Fit, Labelled, covered_share, phase_information
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints
 from polmvs.surface.visual_hull import HullTolerances
@@ -37,7 +38,7 @@ Mask = NDArray[np.bool_]
 MIN_EXCESS = 1e-3  # least excess probability of one kind of light over the other
 MAX_SIGMAS = 3.0  # of a value above which it is a contradiction
 MAX_SHARE = 0.1  # share of a surface or its silhouettes in contradiction. Guess
-ONE_SIDED = 1.645  # deviations of a normal distribution, which 5 % exceed
+SIGNIFICANCE = 0.95  # of a one-sided test
 MIN_POINTS = 10  # least number on the surface for a median
 # Explained share of a consistent view, relative to the median view. Measured on eleven captures,
 # each with the pose of one view exchanged: 0.80 and more; wrong ones under PPA had 0.47 and
@@ -95,7 +96,7 @@ class FaceEvidence:
     num_rows : (F,) int, views with a phase there.
     num_contradicting : (F,) int, views whose phase contradicts its normal.
     num_outlines : (F,) int, views that see it at their outline.
-    information : (F,) of all its phases, nats (:meth:`polmvs.surface.solver.Labelled.information`).
+    information : (F,) of all its phases, nats (:func:`polmvs.surface.solver.phase_information`).
     """
 
     num_views: NDArray[np.int64]
@@ -159,7 +160,9 @@ def face_evidence(
         num_rows=np.bincount(face, minlength=num),
         num_contradicting=np.bincount(face[labelled.contradicts(mesh)], minlength=num),
         num_outlines=outlines,
-        information=np.bincount(face, labelled.information(mesh, fit), num).astype(np.float64),
+        information=np.bincount(
+            face, phase_information(mesh, labelled.observations, fit), num
+        ).astype(np.float64),
     )
 
 
@@ -222,11 +225,16 @@ def contradicted_faces(
     return _wide_parts(mesh, information < 0, gsd)
 
 
-def pixel_information(mesh: TriangleMesh, fit: Fit) -> sparse.csr_array:
-    """Information of the phases of V views on each face, ``(V, F)``: nats, summed over pixels."""
-    labelled = label(mesh, fit)
-    seen = labelled.observations
-    information = labelled.information(mesh, fit)
+def pixel_information(
+    mesh: TriangleMesh, fit: Fit, beside: TriangleMesh | None = None
+) -> sparse.csr_array:
+    """Information of the phases of V views on each face, ``(V, F)``: nats, summed over pixels.
+
+    The mesh is hidden by itself, and by what is ``beside`` it.
+    """
+    scene = RayScene(mesh if beside is None else mesh.with_faces_of(beside))
+    seen = observe(mesh, scene, fit.views, fit.images, fit.looking)
+    information = phase_information(mesh, seen, fit)
     found = np.zeros(len(seen.face))
     for one in seen.of_views():
         face, number = seen.face[one], int(seen.view[one.start])
@@ -237,9 +245,9 @@ def pixel_information(mesh: TriangleMesh, fit: Fit) -> sparse.csr_array:
     return sparse.coo_array((found, (seen.view, seen.face)), shape=shape).tocsr()
 
 
-def view_information(mesh: TriangleMesh, fit: Fit) -> Array:
-    """Information of the phases of each of V views, ``(V,)``: nats, summed over its pixels."""
-    return np.asarray(pixel_information(mesh, fit).sum(axis=1))
+def view_information(mesh: TriangleMesh, fit: Fit, beside: TriangleMesh | None = None) -> Array:
+    """Information (V,) of the phases of each view, nats; as of :func:`pixel_information`."""
+    return np.asarray(pixel_information(mesh, fit, beside).sum(axis=1))
 
 
 def misfit(mesh: TriangleMesh, labelled: Labelled) -> Array:
@@ -623,7 +631,7 @@ def stand_apart(unexplained: Array, least: float) -> Mask:
 def points_deny(moved: TriangleMesh, mesh: TriangleMesh, known: KnownPoints, gsd: float) -> bool:
     """Whether known points lie nearer to a mesh than to the same mesh after a move.
 
-    It uses the signed-rank test (Wilcoxon 1945) at 5 %. Few points never deny a move. (The test of
+    It uses the signed-rank test (Wilcoxon 1945). Few points never deny a move. (The test of
     scipy.stats takes most of a second to import.)
     """
     (far, _, on_moved), (near, _, on_mesh) = (
@@ -637,7 +645,7 @@ def points_deny(moved: TriangleMesh, mesh: TriangleMesh, known: KnownPoints, gsd
     num = len(change)
     farther = np.flatnonzero(change[np.argsort(np.abs(change))] > 0) + 1
     mean, variance = num * (num + 1) / 4, num * (num + 1) * (2 * num + 1) / 24
-    return bool(farther.sum() - mean > ONE_SIDED * np.sqrt(variance))
+    return bool(farther.sum() - mean > special.ndtri(SIGNIFICANCE) * np.sqrt(variance))
 
 
 def _offsets(

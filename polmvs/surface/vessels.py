@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polmvs.geometry import points_on_rays
 from polmvs.surface.cavities import Cavity, find_vessel
-from polmvs.surface.mesh_geometry import RayScene, SignedDistance, remeshed
+from polmvs.surface.mesh_geometry import DistanceGrid, RayScene, SignedDistance
 from polmvs.surface.solver import (
     REMESHING_LOSS,
     Fit,
@@ -55,8 +55,10 @@ def opened_hull(
         return hull, None
     fit = fit.at_width(fit.tol.levels[0].width_px)
 
+    grid = DistanceGrid.of(scene, hull.step)
+
     def carved(*free: SignedDistance) -> RayScene:
-        return RayScene(remeshed(scene, hull.step, free=free, smoothing=0))
+        return RayScene(grid.mesh(free=free, smoothing=0))
 
     def information(scene: RayScene) -> Array:
         """Of the phases of each view, nats."""

@@ -3,6 +3,7 @@ import pytest
 from analytic_objects import box, euler_number, extracted, side_by_side, sphere, torus, union
 
 from polmvs.surface.mesh_geometry import (
+    DistanceGrid,
     RayScene,
     TriangleMesh,
     mesh_from_grid,
@@ -94,6 +95,26 @@ def test_remeshing_joins_pieces_that_met_and_drops_specks():
     mesh = remeshed(RayScene(side_by_side(first, second, speck)), 0.08)
     assert euler_number(mesh) == 2
     assert mesh.vertices[:, 2].max() < 1.0
+
+
+def test_a_grid_about_a_box_holds_the_part_in_it_with_space_carved():
+    """The part is open where the box cuts it; the bore through the whole ball crosses the part."""
+    scene, step = RayScene(extracted(sphere())), 0.06
+    box = ((-2.0, -0.3, 0.2), (2.0, 0.3, 2.0))
+    part = DistanceGrid.of(scene, step, box).mesh(
+        free=[lambda points: 0.2 - np.hypot(points[:, 0], points[:, 1])], smoothing=0
+    )
+    away = np.linalg.norm(part.vertices, axis=1)
+    axis = np.hypot(part.vertices[:, 0], part.vertices[:, 1])
+    assert (np.minimum(np.abs(away - 1), np.abs(axis - 0.2)) < 0.5 * step).all()
+    assert (axis < 0.2 + 0.5 * step).any()
+    assert axis.min() > 0.1
+    margin = 5 * step
+    assert (part.vertices > np.array(box[0]) - margin).all()
+    assert (part.vertices < np.array(box[1]) + margin).all()
+    inside = ((scene.mesh.centers > box[0]) & (scene.mesh.centers < box[1])).all(axis=1)
+    inside &= np.hypot(*scene.mesh.centers[:, :2].T) > 0.3
+    assert RayScene(part).distance(scene.mesh.centers[inside]).max() < 0.5 * step
 
 
 def test_distances_and_hits_far_from_the_origin():

@@ -9,7 +9,7 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.surface.creases import sided_normals
 from polmvs.surface.mesh_geometry import TriangleMesh
 from polmvs.surface.observations import Looking
-from polmvs.surface.solver import first_fit, label
+from polmvs.surface.solver import first_fit, label, phase_information
 from polmvs.surface.surface_quality import (
     MIN_EXPLAINED,
     FaceEvidence,
@@ -115,21 +115,19 @@ def test_a_vertex_whose_phases_fit_worse_than_elsewhere_is_less_certain(exact):
 
 def test_phases_of_another_place_carry_no_information(exact):
     fit = fit_of(np.radians(0.5))
-    labelled = label(exact, fit)
-    own = labelled.information(exact, fit)
+    observations = label(exact, fit).observations
+    own = phase_information(exact, observations, fit)
     assert np.median(own) > 1.5
     rng = np.random.default_rng(0)
-    rows = labelled.observations.rows[:, rng.permutation(len(own))]
-    mixed = replace(labelled, observations=replace(labelled.observations, rows=rows))
-    assert mixed.information(exact, fit).mean() < 0
+    mixed = replace(observations, rows=observations.rows[:, rng.permutation(len(own))])
+    assert phase_information(exact, mixed, fit).mean() < 0
 
 
 def test_phases_of_any_direction_carry_no_information(exact):
     fit = fit_of(np.radians(0.5))
-    labelled = label(exact, fit)
-    observations = labelled.observations
+    observations = label(exact, fit).observations
     vague = replace(observations, turn_variance=np.full_like(observations.turn_variance, 100.0))
-    information = replace(labelled, observations=vague).information(exact, fit)
+    information = phase_information(exact, vague, fit)
     assert np.allclose(information, 0, atol=0.015)
 
 
@@ -144,6 +142,19 @@ def test_information_of_a_view_does_not_depend_on_the_mesh(exact):
     assert fine.shape == (len(fit.views),)
     assert (fine / (np.pi * 30**2) > 0.5).all()
     assert (fine / (np.pi * 30**2) < 5).all()
+
+
+def test_what_lies_beside_a_part_hides_it(exact):
+    """Two halves of a ball have the information of the whole, each with the other beside it."""
+    fit = fit_of(np.radians(2.0))
+    is_left = exact.centers[:, 0] < 0
+    left, right = (TriangleMesh(exact.vertices, exact.faces[own]) for own in (is_left, ~is_left))
+    parts = view_information(left, fit, right) + view_information(right, fit, left)
+    np.testing.assert_allclose(parts, view_information(exact, fit), rtol=1e-6)
+    wall = exact.moved(np.array([0.0, 0.0, 20.0]))  # beyond the cameras
+    np.testing.assert_allclose(view_information(exact, fit, wall), view_information(exact, fit))
+    shell = TriangleMesh(1.5 * exact.vertices, exact.faces)
+    assert (view_information(exact, fit, shell) == 0).all()
 
 
 def test_phases_that_all_say_little_determine_faces_with_less():
