@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import cache, cached_property, lru_cache, partial
 from itertools import compress
 from pathlib import Path
 
@@ -48,10 +48,12 @@ from polmvs.surface.mesh_geometry import (
 )
 from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
+    PatchGroup,
     PatchScene,
     SteppedPatches,
     find_patches,
     free_spaces,
+    patch_groups,
     patch_scene,
     stepped_patches,
 )
@@ -254,7 +256,8 @@ def reconstruct_surface(
     _warn_of_inconsistent(looking.angle_model, first.views, refined)
     if not len(refined.mesh.faces):
         return Undetermined("the surface vanishes under the phases of the views")
-    given = replace(given, scene=given.scene.of(~refined.left_out))
+    if refined.left_out.any():
+        given = replace(given, scene=given.scene.of(~refined.left_out))
     steps, cavities = _carvings(given, first, refined)
     free = _free_of_points(first, refined)
     mesh, fit = (refined.mesh, refined.fit) if free is None else free
@@ -371,17 +374,15 @@ class _Given:
     min_views: int
     on_progress: OnProgress
 
+    @cached_property
+    def groups(self) -> tuple[PatchGroup, ...]:
+        """Groups of parallel patches on which the points lie."""
+        views = self.scene.of(evenly_chosen(len(self.scene.maps), MAX_PATCH_VIEWS))
+        return patch_groups(find_patches(self.seeds), self.seeds, views)
+
     def steps(self, scene: RayScene, *, is_refined: bool) -> tuple[SteppedPatches, ...]:
         """Planar patches where they explain more phases than a surface."""
-        return tuple(
-            stepped_patches(
-                find_patches(self.seeds),
-                self.seeds,
-                self.scene.of(evenly_chosen(len(self.scene.maps), MAX_PATCH_VIEWS)),
-                surface=scene,
-                is_refined=is_refined,
-            )
-        )
+        return stepped_patches(self.groups, surface=scene, is_refined=is_refined)
 
 
 def consistent_hull(

@@ -423,37 +423,99 @@ def _without_interlopers(patches: Sequence[Patch], points: Array) -> list[Patch]
     return kept
 
 
-def stepped_patches(
-    patches: Sequence[Patch],
-    seeds: Seeds,
-    scene: PatchScene,
-    *,
-    surface: RayScene | None = None,
-    is_refined: bool = False,
-) -> tuple[SteppedPatches, ...]:
-    """Groups of parallel patches with their extents, where a surface does not explain more phases.
+@dataclass(frozen=True)
+class PatchGroup:
+    """Parallel patches over a grid, and what the views show on them, whatever the surface is.
+
+    Attributes
+    ----------
+    patches, grid : as of :class:`SteppedPatches`.
+    scene : the views.
+    to_points : (G, H, W) distance in cells to the points of each patch.
+    """
+
+    patches: tuple[Patch, ...]
+    grid: PatchGrid
+    scene: PatchScene
+    to_points: Array
+
+    @cached_property
+    def places(self) -> list[Array]:
+        """Points ``(H, W, 3)`` of each patch over the cells."""
+        return [self.grid.points(patch) for patch in self.patches]
+
+    @cached_property
+    def rise(self) -> Array:
+        """(G, H, W) height of each patch over the grid's origin."""
+        return np.stack([(place - self.grid.origin) @ self.grid.axis for place in self.places])
+
+    @cached_property
+    def losses(self) -> list[Image]:
+        """Loss (K, H, W) of the rows on each patch."""
+        return [self.scene.losses_on(*own) for own in zip(self.places, self.patches, strict=True)]
+
+    @property
+    def near_points(self) -> Mask:
+        """(G, H, W) bool, where edges may be those of the printed marks of a patch."""
+        return np.asarray(self.to_points < 0.5 * TOL.mark_px)
+
+    @cached_property
+    def unhidden(self) -> list[PatchEvidence]:
+        """Evidence for each patch as if no other hid it."""
+        return [self.evidence(number, None) for number in range(len(self.patches))]
+
+    def evidence(self, number: int, labels: NDArray[np.int64] | None) -> PatchEvidence:
+        """Evidence for a patch that the others hide where the labels (H, W) are theirs."""
+        patch, places, maps = self.patches[number], self.places[number], self.scene.maps
+        hidden = None
+        if labels is not None:
+            hidden = _hidden(number, self.patches, places, self.grid, labels, maps)
+        near = self.near_points[number]
+        return patch_evidence(places, patch, self.scene, self.losses[number], near, hidden)
+
+
+def patch_groups(
+    patches: Sequence[Patch], seeds: Seeds, scene: PatchScene
+) -> tuple[PatchGroup, ...]:
+    """Groups of parallel patches, over grids of what the views show.
 
     Parameters
     ----------
     patches : from :func:`find_patches`.
     seeds : their members.
     scene : the views.
+    """
+    found = []
+    for group in _grouped(patches):
+        points = seeds.points_in_world[np.concatenate([patch.members for patch in group])]
+        grid = _grid_over(group, points, scene.maps, _gsd(points, scene.maps))
+        if grid is not None:
+            cells = [grid.cells(seeds.points_in_world[patch.members]) for patch in group]
+            to_points = np.stack([_distance_to(own, grid.shape) for own in cells])
+            found.append(PatchGroup(tuple(group), grid, scene, to_points))
+    return tuple(found)
+
+
+def stepped_patches(
+    groups: Sequence[PatchGroup], *, surface: RayScene | None = None, is_refined: bool = False
+) -> tuple[SteppedPatches, ...]:
+    """The patches of each group with their extents, where a surface does not explain more phases.
+
+    Parameters
+    ----------
+    groups : from :func:`patch_groups`.
     surface : what the patches carve; it remains where fewer views contradict it. None: unknown.
     is_refined : the surface has the object's normals, so where more views contradict it than a
         patch, this speaks for the patch; of a hull it does not.
     """
     found = []
-    for group in _grouped(patches):
-        points = seeds.points_in_world[np.concatenate([patch.members for patch in group])]
-        gsd = _gsd(points, scene.maps)
-        grid = _grid_over(group, points, scene.maps, gsd)
-        if grid is None:
-            continue
-        labels, shown = _labels(group, seeds, grid, scene, surface, is_refined)
+    for group in groups:
+        labels, shown = _labels(group, surface, is_refined)
         if (labels != NO_PATCH).any():
-            not_drawn = np.zeros((len(group), *grid.shape), np.float32)
-            steps = SteppedPatches(tuple(group), grid, labels, shown, not_drawn)
-            beside = [_border(steps, number, scene) for number in range(len(group))]
+            num, grid = len(group.patches), group.grid
+            not_drawn = np.zeros((num, *grid.shape), np.float32)
+            steps = SteppedPatches(group.patches, grid, labels, shown, not_drawn)
+            beside = [_border(steps, number, group.scene) for number in range(num)]
             found.append(replace(steps, beside=np.stack(beside)))
     return tuple(found)
 
@@ -676,52 +738,30 @@ class PatchEvidence:
 
 
 def _labels(
-    group: Sequence[Patch],
-    seeds: Seeds,
-    grid: PatchGrid,
-    scene: PatchScene,
-    surface: RayScene | None,
-    is_refined: bool,
+    group: PatchGroup, surface: RayScene | None, is_refined: bool
 ) -> tuple[NDArray[np.int64], Mask]:
     """Number of the patch at each cell, ``NO_PATCH`` where there is none, and where it is shown."""
-    places = [grid.points(patch) for patch in group]
-    rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
-    of_surface = _surface_misfit(grid, rise.max(axis=0), scene, surface)
+    grid, num, rise = group.grid, len(group.patches), group.rise
+    of_surface = _surface_misfit(grid, rise.max(axis=0), group.scene, surface)
     labels, shown = np.full(grid.shape, NO_PATCH), np.zeros(grid.shape, np.bool_)
-    losses = [scene.losses_on(*own) for own in zip(places, group, strict=True)]
-    to_points = np.stack(
-        [
-            _distance_to(grid.cells(seeds.points_in_world[patch.members]), grid.shape)
-            for patch in group
-        ]
-    )
-    near = to_points < 0.5 * TOL.mark_px
     # Occlusion between patches needs labels: a second pass uses those of the first.
-    for _ in range(min(len(group), 2)):
-        of_patches = [
-            patch_evidence(
-                places[number],
-                patch,
-                scene,
-                losses[number],
-                near[number],
-                _hidden(number, group, places[number], grid, labels, scene.maps),
-            )
-            for number, patch in enumerate(group)
-        ]
+    for count in range(min(num, 2)):
+        of_patches = group.unhidden
+        if count:
+            of_patches = [group.evidence(number, labels) for number in range(num)]
         possible = np.stack([evidence.possible for evidence in of_patches])
-        excess = _excess(group, of_patches, near, of_surface, is_refined)
-        claims_of = partial(_claim, to_points)
+        excess = _excess(group, of_patches, possible, of_surface, is_refined)
+        claims_of = partial(_claim, group.to_points)
         with ThreadPoolExecutor(default_num_workers()) as pool:
-            claims = np.stack(list(pool.map(claims_of, range(len(group)), of_patches, excess)))
+            claims = np.stack(list(pool.map(claims_of, range(num), of_patches, excess)))
         # The other walks end on the refined surface. Without one, a cell far from few points has a
         # small probability of reaching them, but belongs to the patch if no other can be there.
         total = 1.0 if is_refined else claims.sum(axis=0)
         claimed = (claims.max(axis=0) > 0.5 * total) & (claims.sum(axis=0) > TOL.min_total)
         labels = np.where(claimed, claims.argmax(axis=0), NO_PATCH)
-        labels = _without_small(labels, len(group))
+        labels = _without_small(labels, num)
         # The lowest patch ends where others stand on it; there their own borders count.
-        for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1))[1:]:
+        for number in np.argsort(np.median(rise.reshape(num, -1), axis=1))[1:]:
             labels = snapped_border(
                 labels, int(number), of_patches[number].jump, TOL.min_radius_cells, TOL.line_steps
             )
@@ -736,28 +776,28 @@ def _labels(
 
 
 def _excess(
-    group: Sequence[Patch],
+    group: PatchGroup,
     of_patches: Sequence[PatchEvidence],
-    near_points: Mask,
+    possible: Mask,
     of_surface: Image,
     is_refined: bool,
 ) -> Array:
     """How many views more contradict each patch (G, H, W) than what else may be there.
 
-    That is a refined surface. Over a hull it is also a parallel patch, except ``near_points``
-    (G, H, W) of the patch itself, whose print has phases of its own, or what contradicts half of
-    the views. ``of_surface`` (H, W) contradict the given surface, NaN where there is none.
+    That is a refined surface. Over a hull it is also a parallel patch, except near points of the
+    patch itself, whose print has phases of its own, or what contradicts half of the views.
+    ``possible`` (G, H, W) are the cells where views show a patch; ``of_surface`` (H, W) contradict
+    the given surface, NaN where there is none.
     """
     misfit = np.stack([one.misfit for one in of_patches]).astype(np.float64)
     num_phases = np.stack([one.num_phases for one in of_patches])
-    possible = np.stack([one.possible for one in of_patches])
     # Patches are seen by different numbers of views.
     share = np.where(possible, misfit / np.maximum(num_phases, 1), np.nan)
-    normals = np.stack([patch.normal for patch in group])
+    normals = np.stack([patch.normal for patch in group.patches])
     parallel = normals @ normals.T > np.cos(np.radians(TOL.normal_deg))
     np.fill_diagonal(parallel, False)
     others = np.stack([np.fmin.reduce(share[own], axis=0, initial=MAX_COST) for own in parallel])
-    others[near_points] = MAX_COST
+    others[group.near_points] = MAX_COST
     # Normals of a hull are not those of the object: it cannot speak for a patch.
     against = np.maximum(misfit - np.fmin(of_surface, others * num_phases), 0)
     if is_refined:

@@ -183,6 +183,7 @@ class Fit:
     gsd : ground sampling distance at the surface, world units.
     known : points of the surface.
     tol : tolerances.
+    width_px : of the images' smoothing; NaN without images.
     """
 
     views: Sequence[SurfaceView]
@@ -192,6 +193,7 @@ class Fit:
     gsd: float
     known: KnownPoints | None
     tol: SolverTolerances
+    width_px: float = float("nan")
 
     def face_area_px(self, mesh: TriangleMesh) -> float:
         """Mean area of a mesh's faces, px^2."""
@@ -202,10 +204,12 @@ class Fit:
         return self.tol.terms.independent_px * level.width_px**2 * self.gsd**2
 
     def at_width(self, width_px: float) -> Fit:
-        """The fit with images smoothed over another width."""
+        """The fit with images smoothed over a width."""
+        if width_px == self.width_px:
+            return self
         with ThreadPoolExecutor(default_num_workers()) as pool:
             images = list(pool.map(lambda view: level_image(view, width_px), self.views))
-        return replace(self, images=images)
+        return replace(self, images=images, width_px=width_px)
 
     def of(self, kept: Mask) -> Fit:
         """The fit of some views (K,)."""

@@ -29,7 +29,7 @@ from polmvs.surface.global_surface import (
 )
 from polmvs.surface.mesh_geometry import RayScene
 from polmvs.surface.observations import Looking
-from polmvs.surface.offsets import find_patches, patch_scene, stepped_patches
+from polmvs.surface.offsets import find_patches, patch_groups, patch_scene, stepped_patches
 from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.solver import Level, SolverTolerances
 from polmvs.surface.surface_quality import (
@@ -369,7 +369,8 @@ def test_a_plane_carves_a_flat_top_and_not_a_round_one(distance, height, is_flat
     points = np.column_stack([0.2 * np.cos(around), 0.2 * np.sin(around), np.full(6, height)])
     seeds = Seeds(points, np.tile([0, 0, 1.0], (6, 1)), np.full(6, 1e-3))
     (patch,) = find_patches(seeds)
-    steps = stepped_patches([patch], seeds, patch_scene(maps, PPA), surface=RayScene(hull.mesh))
+    groups = patch_groups([patch], seeds, patch_scene(maps, PPA))
+    steps = stepped_patches(groups, surface=RayScene(hull.mesh))
     above = np.random.default_rng(0).uniform([-0.8, -0.8, 0], [0.8, 0.8, 0.2], (500, 3))
     above = above[np.hypot(*above.T[:2]) < 0.8] + [0, 0, height + GSD]
     free = [(group.values(above) > 0).mean() for group in steps]

@@ -18,6 +18,7 @@ from polmvs.surface.offsets import (
     SteppedPatches,
     find_patches,
     free_spaces,
+    patch_groups,
     patch_scene,
     snapped_border,
     stepped_patches,
@@ -138,7 +139,7 @@ def test_space_above_the_faces_of_a_step_is_free(height, tilt_deg):
     scene = step_scene(height, tilt_deg)
     patches = find_patches(scene.seeds)
     assert sorted(len(patch.members) for patch in patches) == [9, 10]
-    (group,) = stepped_patches(patches, scene.seeds, patch_scene(scene.maps, AngleModel.PPA))
+    (group,) = steps_of(scene.seeds, scene.maps)
     points = column_points()
     above = points[:, 2] - scene.true_height(points[:, :2])
     clear = np.abs(above) > 1e-3
@@ -150,11 +151,14 @@ def test_space_above_the_faces_of_a_step_is_free(height, tilt_deg):
     assert np.quantile(np.abs(group.values(points[near]) - above[near] * cosine), 0.95) < 5e-4
 
 
+def steps_of(seeds, maps, **given):
+    groups = patch_groups(find_patches(seeds), seeds, patch_scene(maps, AngleModel.PPA))
+    return stepped_patches(groups, **given)
+
+
 def free_share(scene):
     """Share of the points above the plate beside the box that are free, and of those in the box."""
-    (group,) = stepped_patches(
-        find_patches(scene.seeds), scene.seeds, patch_scene(scene.maps, AngleModel.PPA)
-    )
+    (group,) = steps_of(scene.seeds, scene.maps)
     points = column_points()
     outside = np.abs(points[:, :2]).max(axis=1)
     free = group.values(points) > 0
@@ -180,9 +184,7 @@ def test_walls_stand_where_the_intensity_steps(top_gain, most):
     Polarization alone shows the border then, whose steps the regions' smoothing widens.
     """
     scene = step_scene(0.03, top_gain=top_gain)
-    (group,) = stepped_patches(
-        find_patches(scene.seeds), scene.seeds, patch_scene(scene.maps, AngleModel.PPA)
-    )
+    (group,) = steps_of(scene.seeds, scene.maps)
     along = np.linspace(-0.7, 0.7, 41) * BOX
     beside = np.arange(-3, 3.05, 0.1) * GSD
     medians, squares = [], []
@@ -212,11 +214,9 @@ def height_field(height) -> RayScene:
 
 def test_a_surface_that_explains_all_phases_is_left_alone():
     scene = step_scene(0.03, num_views=3)
-    maps = patch_scene(scene.maps, AngleModel.PPA)
-    (group,) = stepped_patches(
-        find_patches(scene.seeds),
+    (group,) = steps_of(
         scene.seeds,
-        maps,
+        scene.maps,
         surface=height_field(scene.true_height),
         is_refined=True,
     )
@@ -230,10 +230,9 @@ def test_a_recess_ends_at_its_walls_where_its_rim_has_no_points():
     scene = step_scene(-0.02, top_gain=1.0)
     of_floor = (scene.seeds.points_in_world[:9], scene.seeds.normals_in_world[:9])
     floor = Seeds(*of_floor, scene.seeds.sigma[:9])
-    (group,) = stepped_patches(
-        find_patches(floor),
+    (group,) = steps_of(
         floor,
-        patch_scene(scene.maps, AngleModel.PPA),
+        scene.maps,
         surface=height_field(lambda xy: np.zeros(len(xy))),
         is_refined=True,
     )
@@ -261,9 +260,7 @@ def test_what_stands_on_a_face_is_not_carved(knows_the_ball):
         given = RayScene(
             TriangleMesh(np.asarray(sphere.vertices) + center, np.asarray(sphere.faces, np.int64))
         )
-    (group,) = stepped_patches(
-        find_patches(seeds), seeds, patch_scene(maps, AngleModel.PPA), surface=given
-    )
+    (group,) = steps_of(seeds, maps, surface=given)
     rng = np.random.default_rng(0)
     inside = rng.normal(size=(500, 3))
     inside = center + 0.8 * radius * inside / np.linalg.norm(inside, axis=1, keepdims=True)
@@ -296,7 +293,7 @@ def test_points_of_a_curved_surface_or_too_few_make_no_large_face():
     assert find_patches(few) == ()
     unknown = Seeds(0.05 * normals, np.full((60, 3), np.nan), np.full(60, SIGMA))
     assert find_patches(unknown) == ()
-    assert stepped_patches((), few, patch_scene([], AngleModel.PPA)) == ()
+    assert steps_of(few, []) == ()
 
 
 def face_seeds(xy, height):
@@ -340,8 +337,7 @@ def test_a_border_follows_its_lines_around_corners():
 
 def test_what_stands_on_the_lowest_face_is_solid():
     scene = step_scene(0.03, 0.0)
-    patches = find_patches(scene.seeds)
-    (group,) = stepped_patches(patches, scene.seeds, patch_scene(scene.maps, AngleModel.PPA))
+    (group,) = steps_of(scene.seeds, scene.maps)
     points = column_points()
     inside = (np.abs(points[:, :2]) < BOX).all(axis=1) & (points[:, 2] > 0) & (points[:, 2] < 0.03)
     clear = np.minimum(np.abs(points[:, 2]), np.abs(points[:, 2] - 0.03)) > 1e-3
