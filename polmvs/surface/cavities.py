@@ -457,11 +457,18 @@ def _likeliest_thickness(
             gains[number] = np.array([-np.inf]) if cavity is None else gain(cavity)
         return float(gains[number].sum())
 
+    def may_add(number: int) -> bool:
+        """Whether a wall thinner than one that adds nothing may add some, by ever smaller rises."""
+        rise = total(number) - total(number + 1)
+        return total(number) > 0 or total(number) + (number - THINNEST) * rise > 0
+
     best = 1
     # A thicker wall leaves less of a cavity that adds nothing, so only thinner ones may add any.
     for step in (1, -1) if total(best) > 0 else (-1,):
         while total(best + step) > total(best):
             best += step
+            if step < 0 and not may_add(best):
+                return None
     if not total(best) > 0:
         return None
     shift, sigma = _vertex(gains[best - 1], gains[best], gains[best + 1])

@@ -963,10 +963,12 @@ def patch_evidence(
 
 def patch_lines(places: Array, patch: Patch, scene: PatchScene, view_share: float) -> Image:
     """Edges (H, W) in units of noise that a share of the views shows at points (H, W, 3)."""
-    jumps = np.full((len(scene.maps), *places.shape[:2]), np.nan, np.float32)
-    for k, phase_map in enumerate(scene.maps):
-        xy, seen = _seen(places, patch, phase_map)
-        jumps[k] = _line_steps(scene.features[k], xy, seen)[0]
+
+    def of_view(phase_map: PhaseMap, images: ArrayLike) -> Image:
+        return _line_steps(images, *_seen(places, patch, phase_map))[0]
+
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        jumps = np.stack(list(pool.map(of_view, scene.maps, scene.features)))
     return _shared_lines(jumps, view_share)
 
 
