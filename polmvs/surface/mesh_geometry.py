@@ -611,14 +611,13 @@ def _signed_distances(
         values[doubtful] = scene.signed_distance(origin + step * np.argwhere(doubtful))
     values[band] = np.clip(values[band], -limit, limit)
     values[~band] = limit
+    # Outside of the band each piece has the sign of any of its points.
     pieces, num_pieces = ndimage.label(~band)
-    # Outside of the band a piece has the sign of the adjacent band.
-    if num_pieces > 1:
-        beside = ndimage.grey_dilation(np.where(band, 0, pieces), size=(3, 3, 3))
-        touching = band & (beside > 0)
-        negative = np.bincount(beside[touching], values[touching] < 0, num_pieces + 1)
-        total = np.bincount(beside[touching], minlength=num_pieces + 1)
-        values[(negative > 0.5 * total)[pieces] & (pieces > 0)] = -limit
+    points = np.zeros(num_pieces + 1, np.int32)
+    points[pieces.ravel()] = np.arange(pieces.size, dtype=np.int32)
+    cells = np.stack(np.unravel_index(points[1:], shape), axis=1)
+    of_pieces = np.append(False, scene.is_inside(origin + step * cells))
+    values[of_pieces[pieces]] = -limit
     return values
 
 

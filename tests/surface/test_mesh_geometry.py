@@ -117,6 +117,17 @@ def test_a_grid_about_a_box_holds_the_part_in_it_with_space_carved():
     assert RayScene(part).distance(scene.mesh.centers[inside]).max() < 0.5 * step
 
 
+def test_a_grid_inside_a_solid_is_solid():
+    """Its points are farther from the surface than the band in which distances are computed."""
+    scene = RayScene(extracted(sphere()))
+    inner = DistanceGrid.of(scene, 0.02, ((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)))
+    assert (inner.values < 0).all()
+    beside = DistanceGrid.of(scene, 0.02, ((-0.2, -0.2, 0.5), (0.2, 0.2, 0.9)))
+    heights = beside.origin[2] + 0.02 * np.arange(beside.values.shape[2])
+    middle = tuple(num // 2 for num in beside.values.shape[:2])
+    assert ((beside.values[middle] < 0) == (heights < 1 - 1e-3)).all()
+
+
 def test_distances_and_hits_far_from_the_origin():
     far = np.array([1e4, -2e4, 500.0])
     mesh = extracted(sphere())
