@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 
 import numpy as np
 
@@ -143,11 +144,7 @@ def extracted(distance, half=1.6, step=0.08) -> TriangleMesh:
 
 def side_by_side(*parts: TriangleMesh) -> TriangleMesh:
     """One mesh of several that may overlap."""
-    offsets = np.cumsum([0] + [len(m.vertices) for m in parts[:-1]])
-    return TriangleMesh(
-        np.concatenate([m.vertices for m in parts]),
-        np.concatenate([m.faces + o for m, o in zip(parts, offsets, strict=True)]),
-    )
+    return reduce(TriangleMesh.with_faces_of, parts)
 
 
 def euler_number(mesh: TriangleMesh) -> int:

@@ -518,13 +518,9 @@ class DistanceGrid:
 
     @classmethod
     def of(cls, scene: RayScene, step: float, box: Box | None = None) -> DistanceGrid:
-        """The grid about the mesh of a scene, or about its part in a box."""
+        """The grid about the mesh of a scene, which has faces, or about its part in a box."""
         vertices = scene.mesh.vertices
-        if not len(vertices):
-            return cls(np.ones((1, 1, 1), np.float32), np.zeros(3), step)
-        low, high = (
-            (vertices.min(axis=0), vertices.max(axis=0)) if box is None else map(np.array, box)
-        )
+        low, high = (vertices.min(axis=0), vertices.max(axis=0)) if box is None else np.array(box)
         origin = low - (BAND_CELLS + 1) * step
         shape = tuple(int(n) for n in np.ceil((high - low) / step) + 2 * BAND_CELLS + 3)
         return cls(_signed_distances(scene, origin, step, shape), origin, step)
@@ -611,7 +607,7 @@ def _signed_distances(
         values[doubtful] = scene.signed_distance(origin + step * np.argwhere(doubtful))
     values[band] = np.clip(values[band], -limit, limit)
     values[~band] = limit
-    # Outside of the band each piece has the sign of any of its points.
+    # Beyond the band each piece has the sign of any of its points.
     pieces, num_pieces = ndimage.label(~band)
     points = np.zeros(num_pieces + 1, np.int32)
     points[pieces.ravel()] = np.arange(pieces.size, dtype=np.int32)

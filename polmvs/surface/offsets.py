@@ -175,6 +175,10 @@ class PatchGrid:
         local = np.asarray(points, np.float64) - self.origin
         return np.stack([local @ self.first, local @ self.second], axis=-1) / self.step
 
+    def rise(self, points: Array) -> Array:
+        """Height ``(...)`` of points ``(..., 3)`` over the grid."""
+        return np.asarray((points - self.origin) @ self.axis)
+
     def box_of(self, points: Array) -> Box:
         """The box about those of points ``(N, 3)`` that lie above or below the cells."""
         own = points[in_frame(self.cells(points), *np.array(self.shape) - 1)]
@@ -247,7 +251,7 @@ class SteppedPatches:
 
         A patch continues below those that stand on it: it has no border inside the solid.
         """
-        heights = np.stack([self._rise(patch) for patch in self.patches])
+        heights = np.stack([self.grid.rise(self.grid.points(patch)) for patch in self.patches])
         at_label = np.take_along_axis(heights, np.maximum(self.labels, 0)[None], axis=0)[0]
         return np.asarray((self.labels == NO_PATCH) | (at_label >= heights[number]))
 
@@ -288,15 +292,12 @@ class SteppedPatches:
     @cached_property
     def _by_height(self) -> list[tuple[Patch, Image]]:
         """The patches, the lowest first, with the distance to the cells shown not below each."""
-        rise = [float(np.median(self._rise(patch))) for patch in self.patches]
+        rise = [float(np.median(self.grid.rise(self.grid.points(own)))) for own in self.patches]
         shown = self._smoothly_beside(self.shown)
         return [
             (self.patches[number], np.maximum(shown, self.grid.step * self.beside[number]))
             for number in np.argsort(rise, kind="stable")
         ]
-
-    def _rise(self, patch: Patch) -> Array:
-        return np.asarray((self.grid.points(patch) - self.grid.origin) @ self.grid.axis)
 
     def _smoothly_beside(self, inside: Mask) -> Image:
         """Signed distance (H, W) to a set of cells, world units, negative inside."""
@@ -446,15 +447,15 @@ class PatchGroup:
 
     @cached_property
     def rise(self) -> Array:
-        """(G, H, W) height of each patch over the grid's origin."""
-        return np.stack([(place - self.grid.origin) @ self.grid.axis for place in self.places])
+        """(G, H, W) of each patch over the grid."""
+        return np.stack([self.grid.rise(place) for place in self.places])
 
     @cached_property
     def losses(self) -> list[Image]:
         """Loss (K, H, W) of the rows on each patch."""
         return [self.scene.losses_on(*own) for own in zip(self.places, self.patches, strict=True)]
 
-    @property
+    @cached_property
     def near_points(self) -> Mask:
         """(G, H, W) bool, where edges may be those of the printed marks of a patch."""
         return np.asarray(self.to_points < 0.5 * TOL.mark_px)

@@ -54,7 +54,6 @@ def opened_hull(
     if not np.isfinite(height):
         return hull, None
     fit = fit.at_width(fit.tol.levels[0].width_px)
-
     grid = DistanceGrid.of(scene, hull.step)
 
     def carved(*free: SignedDistance) -> RayScene:
