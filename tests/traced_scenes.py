@@ -92,6 +92,7 @@ def lit_scene(
         vertex_albedo=None,
         marks=marks_on(mesh, 0, 0.01, 0),
         surroundings=[],
+        varnish=None,
         environment=environment(LightingOptions(light=light)),
         colour=False,
     )

@@ -42,7 +42,7 @@ from polmvs.simulation.camera_path import camera_views
 from polmvs.simulation.irradiance import bake
 from polmvs.simulation.lights import environment
 from polmvs.simulation.marks import Marks, marks_at, marks_on
-from polmvs.simulation.materials import material_of
+from polmvs.simulation.materials import material_of, varnish_of
 from polmvs.simulation.mesh_input import ObjectMesh, object_mesh
 from polmvs.simulation.options import (
     LightName,
@@ -231,6 +231,7 @@ class _Plan:
                 float(np.linalg.norm(vertices[:, :2], axis=1).max()),
                 seed,
             ),
+            varnish=varnish_of(options.scenery),
             environment=sky,
             colour=options.sensor.colour is not None,
         )

@@ -36,7 +36,7 @@ def bake(scene: MitsubaScene, *, bounces: int, samples: int, spacing: float, see
     spacing : between the vertices of the object at which light is gathered, metres.
     seed : of the directions.
     """
-    material = scene.description.material
+    material, varnish = scene.description.material, scene.description.varnish
     mi = scene.renderer.mi
     meshes = [scene.description.part, *(s.mesh for s in scene.description.surroundings)]
     for index, (shape, mesh) in enumerate(zip(scene.shapes, meshes, strict=True)):
@@ -45,7 +45,7 @@ def bake(scene: MitsubaScene, *, bounces: int, samples: int, spacing: float, see
             continue
         vertices, normals = mesh.vertices, mesh.normals
         chosen = _representatives(vertices, normals, spacing) if is_part else slice(None)
-        ior = material.ior if is_part else None
+        ior = material.ior if is_part else None if varnish is None else varnish.ior
         light = _Gathering(scene=scene, ior=ior, bounces=bounces, samples=samples)
         gathered = light.at(vertices[chosen], normals[chosen], seed + index)
         if is_part:

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from polmvs.errors import OptionError
-from polmvs.simulation.options import MaterialName, Metal, ObjectOptions
+from polmvs.simulation.options import MaterialName, Metal, ObjectOptions, SceneryOptions
+
+VARNISH_IOR = 1.5
 
 # n and k at 550 nm, and the name that Mitsuba's table of spectra has of them.
 METALS = {
@@ -90,6 +92,13 @@ def material_of(options: ObjectOptions) -> Material:
                 field=f"object.{name}",
             )
     return material if options.metal is None else replace(material, metal=options.metal)
+
+
+def varnish_of(options: SceneryOptions) -> Material | None:
+    """The varnish over the surroundings; their prints are the base under it."""
+    if options.varnish is None:
+        return None
+    return Material(albedo=(1.0, 1.0, 1.0), roughness=options.varnish, ior=VARNISH_IOR)
 
 
 def bsdf_of(material: Material, *, colour: bool) -> dict[str, Any]:

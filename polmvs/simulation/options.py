@@ -160,6 +160,13 @@ class SceneryOptions(OptionGroup, group="scenery"):
     surroundings: Scenery = option(
         Scenery.TABLE, "a textured table with clutter, a calibration board, or nothing"
     )
+    varnish: float | None = option(
+        None,
+        "roughness of a varnish over the surroundings (alpha of Beckmann's slopes), as on a desk: "
+        "they mirror and polarize. Without it they are matte",
+        above=0,
+        most=1,
+    )
     turntable: bool = option(
         False, "object and surroundings turn, light, background and camera stand still"
     )

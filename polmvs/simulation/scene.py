@@ -37,7 +37,8 @@ class SceneDescription:
     material : of the object.
     vertex_albedo : (V, 3) of the object's vertices; None: the material's albedo.
     marks : printed on it.
-    surroundings : matte surfaces around it.
+    surroundings : printed surfaces around it.
+    varnish : over the surroundings; None: they are matte.
     environment : (H, 2 H, 3) float32, see :func:`polmvs.simulation.lights.environment`.
     colour : whether spectra are rendered.
     """
@@ -47,6 +48,7 @@ class SceneDescription:
     vertex_albedo: NDArray[np.float32] | None
     marks: Marks
     surroundings: list[Surrounding]
+    varnish: Material | None
     environment: NDArray[np.float32]
     colour: bool
 
@@ -113,8 +115,12 @@ def build_scene(
     for index, surrounding in enumerate(description.surroundings):
         bitmap = mi.Bitmap(np.repeat(surrounding.print[..., None], 3, -1))
         texture = {"type": "bitmap", "bitmap": bitmap, "raw": "mono" in renderer.variant}
-        matte = mi.load_dict({"type": "twosided", "b": {"type": "diffuse", "reflectance": texture}})
-        shape = _shape(renderer, surrounding.mesh, matte, surrounding.uv)
+        if description.varnish is not None:
+            own = bsdf_of(description.varnish, colour=description.colour)
+            own["diffuse_reflectance"] = texture
+        else:
+            own = {"type": "twosided", "b": {"type": "diffuse", "reflectance": texture}}
+        shape = _shape(renderer, surrounding.mesh, mi.load_dict(own), surrounding.uv)
         parts[f"surrounding{index}"] = shape
         shapes.append(shape)
     parts["sky"] = _sky(renderer, description.environment, turn)

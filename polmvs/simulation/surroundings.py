@@ -1,7 +1,7 @@
 """Surroundings of the object: a table with printed clutter, or a calibration board.
 
-SfM needs static features around a part that has none. Everything here is matte: its light is
-unpolarized and the same in all directions.
+SfM needs static features around a part that has none. Without a varnish everything here is matte:
+its light is unpolarized and the same in all directions.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ WHITE, BLACK = 0.8, 0.04  # albedo of paper and ink
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surrounding:
-    """A matte printed surface.
+    """A printed surface.
 
     Attributes
     ----------

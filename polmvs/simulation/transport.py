@@ -267,6 +267,7 @@ def _follow(scene: MitsubaScene, ray: Any, sampler: Any, bounces: int) -> tuple[
         surface = hit.bsdf(ray)
         others = active & ~is_part
         lambertian = surface.eval(matte, hit, upright, others)
+        lambertian = hit.to_world_mueller(lambertian, -upright, hit.wi)
         total = total + gathered(throughput @ lambertian, irradiance, others)
         if scene.base is not None:
             leaving = scene.base.eval(matte, hit, upright, is_part)
@@ -275,7 +276,7 @@ def _follow(scene: MitsubaScene, ray: Any, sampler: Any, bounces: int) -> tuple[
             own = gathered(throughput @ leaving, irradiance * albedo, is_part)
             total = total + own
             diffuse = dr.select(bounce == 0, mi.Vector2f(own.y, own.z), diffuse)
-        active = is_part & (bounce < bounces)
+        active = active & (bounce < bounces)
         reflected, weight = surface.sample(
             specular, hit, sampler.next_1d(active), sampler.next_2d(active), active
         )

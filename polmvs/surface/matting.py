@@ -70,6 +70,7 @@ def find_outline(
     background: Background,
     noise: float,
     *,
+    polarized: Image,
     start_px: float,
 ) -> Image:
     """Signed distance (H, W) to the outline, px, negative inside.
@@ -79,19 +80,21 @@ def find_outline(
     image : (H, W) intensity.
     distance : (H, W) approximate signed distance, right to about ``start_px``.
     noise : least relative deviation of the background's intensity.
+    polarized : (H, W, 2) ``s1`` and ``s2``, in the unit of the intensity.
     """
     scale = max(start_px, 1.0)
+    stokes = np.dstack([image, polarized])
     while scale > 1:
-        distance = _moved(image, distance, background, noise, scale)
+        distance = _moved(stokes, distance, background, noise, scale)
         scale = max(scale / 2, 1.0)
     # The lines of the last pass start at the outline.
     for _ in range(2):
-        distance = _moved(image, distance, background, noise, 1.0)
+        distance = _moved(stokes, distance, background, noise, 1.0)
     return distance
 
 
 def _moved(
-    image: Image,
+    stokes: Image,
     distance: Image,
     background: Background,
     noise: float,
@@ -110,7 +113,7 @@ def _moved(
     along = np.arange(-far, far + STEP, STEP)
     places = onto[:, None] + scale * along[:, None] * outwards[:, None]
     alpha, told = _alpha(
-        image, places, along, sample_image(distance, places) / scale, background, noise, mean
+        stokes, places, along, sample_image(distance, places) / scale, background, noise, mean
     )
     shift = scale * (STEP * (alpha.sum(axis=1) - 0.5) - TOL.reach_px)
     shift = (mean @ (told * shift)) / np.maximum(mean @ told, LEAST_TOLD)
@@ -124,7 +127,7 @@ def _moved(
 
 
 def _alpha(
-    image: Image,
+    stokes: Image,
     places: Array,
     along: Array,
     depth: Image,
@@ -136,27 +139,33 @@ def _alpha(
 
     Parameters
     ----------
+    stokes : (H, W, 3) Stokes parameters.
     places : (N, L, 2) image coordinates of the lines.
     along, depth : (L,) and (N, L), places on the lines and distances from the outline, scaled.
     mean : (N, N) averages over neighbours.
     """
-    height, width = image.shape
-    values = sample_image(image, places)
+    height, width, _ = stokes.shape
+    values = sample_image(stokes, places)
     in_image = in_frame(places, width, height)
     weight = np.where(in_image, np.exp(-0.5 * (along / TOL.blend_px) ** 2), 0)
-    level, slope, own_variance = _line(values, depth, weight * (depth < -TOL.core_px), mean)
-    outer, _, outer_variance = _line(values, depth, weight * (depth > TOL.core_px), mean)
+    within, beyond = weight * (depth < -TOL.core_px), weight * (depth > TOL.core_px)
     near = np.abs(along) <= TOL.reach_px + 1e-9
-    # Shading continues to the outline: the object's brightness there is extrapolated.
-    own = np.maximum(level + slope * np.minimum(along[near], 0), 0)
-    behind, deviation, should_be_known = background(places[:, near])
-    known = np.asarray(np.isfinite(behind), np.bool_)
-    variance = np.where(known, (deviation**2 + noise**2) * behind**2, outer_variance)
-    behind = np.where(known, behind, outer)
-    contrast = own - behind
-    precision = in_image[:, near] / (variance + own_variance)
-    total = mean @ (precision * contrast * (values[:, near] - behind))
-    most = mean @ (precision * contrast**2)
+    predicted, deviation, should_be_known = background(places[:, near])
+    known = np.asarray(np.isfinite(predicted), np.bool_)
+    total, most = np.zeros(known.shape), np.zeros(known.shape)
+    for channel in range(stokes.shape[2]):
+        level, slope, own_variance = _line(values[..., channel], depth, within, mean)
+        behind, _, variance = _line(values[..., channel], depth, beyond, mean)
+        # Shading continues to the outline: what the object shows there is extrapolated.
+        own = level + slope * np.minimum(along[near], 0)
+        if channel == 0:
+            own = np.maximum(own, 0)
+            variance = np.where(known, (deviation**2 + noise**2) * predicted**2, variance)
+            behind = np.where(known, predicted, behind)
+        contrast = own - behind
+        precision = in_image[:, near] / (variance + own_variance)
+        total += mean @ (precision * contrast * (values[:, near, channel] - behind))
+        most += mean @ (precision * contrast**2)
     alpha = np.clip(total / np.maximum(most, 1e-9), 0, 1)
     # An outline needs a mean contrast of one deviation. Beyond it the background is visible;
     # anything else there hides the outline.

@@ -11,7 +11,7 @@ the object, as in matting against a known background.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -170,8 +170,7 @@ def find_object(
     noise = _residual(small, plates, masks)
     odds = _by_texture(shown, _plane_odds(small, plates, noise))
     masks = [fill_false_holes(*pair) for pair in zip(masks, odds, strict=True)]
-    changes = np.concatenate([plate.changes for plate in plates])
-    if not len(changes) or float(np.median(changes)) > noise:
+    if _shadows_pass_for_objects(small, plates, noise):
         return None  # the lamp moves with the camera: outlines would be pixels wide
     # Threads, as sampling images releases Python's lock.
     found: list[FoundObject | None] = [None] * len(small)
@@ -213,12 +212,9 @@ def _shown_plane(
     shares, expected = _showing_plane(views, points)
     # A window next to an outline on the plane contains the outline, also inside the object.
     size = 2 * round(0.5 * TOL.window_px + TOL.detail_px) - 1
-    found = [
-        (cv2.erode(share, np.ones((size, size), np.uint8)) > TOL.least_share) & ~view.polarized
-        for share, view in zip(shares, views, strict=True)
-    ]
-    window = np.ones((TOL.window_px, TOL.window_px), np.uint8)
+    window = np.ones((size, size), np.uint8)
     textured = [cv2.erode(share, window) > TOL.least_share for share in shares]
+    found = [shown & ~view.polarized for shown, view in zip(textured, views, strict=True)]
     hidden = [
         (texture > TOL.least_share) & (share <= TOL.least_share)
         for texture, share in zip(expected, shares, strict=True)
@@ -242,8 +238,10 @@ class _Working:
     view : in its own pixels.
     factor : of its own pixels to a working one.
     intensity : (H, W) float32, in its own pixels.
+    polarized_light : (H, W, 2) float32, ``s1`` and ``s2``; 0 where they are not measured.
     lowest : intensity whose logarithm is the lowest.
     log : (h, w) float32, logarithm of the intensity.
+    polarization : (h, w, 2) float32, ``s1 / s0`` and ``s2 / s0``; NaN where they are not measured.
     region : (h, w) bool, its polarized region.
     polarized : (h, w) bool, the region without what may be background up to the image's border.
     on_plane : (h, w, 3), where each pixel's ray meets the plane; NaN where it does not.
@@ -253,8 +251,10 @@ class _Working:
     view: View
     factor: float
     intensity: Image
+    polarized_light: Image
     lowest: float
     log: Image
+    polarization: Image
     region: Mask
     polarized: Mask
     on_plane: Array
@@ -294,7 +294,31 @@ def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> 
     )
     on_plane = _on_plane(view, plane, pixel_centers(*size) * factor)
     has_plane = np.asarray(np.isfinite(on_plane).all(axis=-1), np.bool_)
-    return _Working(view, factor, image, lowest, log, region, polarized, on_plane, has_plane)
+    measured = np.asarray(phase_map.polarization)
+    light = np.where(np.isfinite(measured[..., 2:3]), measured[..., :2] * image[..., None], 0)
+    return _Working(
+        view=view,
+        factor=factor,
+        intensity=image,
+        polarized_light=light.astype(np.float32),
+        lowest=lowest,
+        log=log,
+        polarization=_smoothed_polarization(measured, size),
+        region=region,
+        polarized=polarized,
+        on_plane=on_plane,
+        has_plane=has_plane,
+    )
+
+
+def _smoothed_polarization(measured: Image, size: tuple[int, int]) -> Image:
+    """``s1 / s0`` and ``s2 / s0`` in an image of some (width, height); NaN where unknown."""
+    known = np.isfinite(measured[..., 2]).astype(np.float32)[..., None]
+    values = np.where(known > 0, measured[..., :2], 0)
+    stack = cv2.resize(np.dstack([values, known]), size, interpolation=cv2.INTER_AREA)
+    stack = cv2.GaussianBlur(stack, (0, 0), BLUR_PX)
+    share = stack[..., 2:]
+    return np.where(share > 0.5, stack[..., :2] / np.maximum(share, 0.5), np.nan)
 
 
 def _on_plane(view: View, plane: SupportingPlane, xy: Floats) -> Array:
@@ -747,13 +771,16 @@ def _background_odds(
 ) -> list[Image]:
     """Log-odds (h, w) that each view's pixels show the plane, or the background beyond it.
 
-    Where the plane is predicted, the brightness tells; where it is not, the appearance.
+    Where the plane is predicted, the brightness tells; where it is not, the appearance. The
+    polarization tells everywhere.
     """
     views, found = plane.views, []
     predicted = _plane_odds(views, plates, _residual(views, plates, masks))
-    appearance = _appearance_odds(plane, masks, predicted)
-    for plate, odds, by_appearance in zip(plates, predicted, appearance, strict=True):
-        odds = np.where(np.isfinite(plate.log), odds, by_appearance)
+    known = _known_pixels(plane, masks, predicted)
+    appearance, polarization = _appearance_odds(plane, known), _polarization_odds(plane, known)
+    for index, plate in enumerate(plates):
+        odds = np.where(np.isfinite(plate.log), predicted[index], appearance[index])
+        odds = np.clip(odds + polarization[index], -MAX_ODDS, MAX_ODDS)
         found.append(np.asarray(cv2.GaussianBlur(odds, (0, 0), BLUR_PX), np.float32))
     return _by_texture(plane, found)
 
@@ -777,12 +804,31 @@ def _by_texture(plane: _Shown, odds: Sequence[Image]) -> list[Image]:
 
 def _plane_odds(views: Sequence[_Working], plates: Sequence[_Plate], noise: float) -> list[Image]:
     """Log-odds (h, w) that each view's pixels show the plane; 0 where it is not predicted."""
-    spread = float(np.mean([np.diff(np.percentile(view.log, (1, 99)))[0] for view in views]))
-    found = []
+    spread, found = _spread(views), []
     for view, plate in zip(views, plates, strict=True):
         odds = _odds(view.log - plate.log, np.hypot(plate.deviation, noise), spread)
         found.append(np.where(np.isfinite(plate.log), odds, 0).astype(np.float32))
     return found
+
+
+def _spread(views: Sequence[_Working]) -> float:
+    """Range of the logarithms of intensity in a view, mean over the views."""
+    return float(np.mean([np.diff(np.percentile(view.log, (1, 99)))[0] for view in views]))
+
+
+def _shadows_pass_for_objects(
+    views: Sequence[_Working], plates: Sequence[_Plate], noise: float
+) -> bool:
+    """Whether shadows that move from view to view are too deep to pass for the plane.
+
+    The change of the plane's brightness over the image, from view to view, is about the share of
+    its light that moves, and so the depth of the shadows of this light.
+    """
+    changes = np.concatenate([plate.changes for plate in plates])
+    if not len(changes):
+        return True
+    depth = np.median(changes, keepdims=True).astype(np.float32)
+    return bool(_odds(depth, np.full_like(depth, noise), _spread(views)) < 0)
 
 
 def _decided(mask: Mask, odds: Image, width_px: float) -> Mask:
@@ -803,13 +849,64 @@ def fill_false_holes(mask: Mask, odds: Floats) -> Mask:
     return mask | np.isin(labels, 1 + np.flatnonzero(shown <= LEAST_ODDS))
 
 
-def _appearance_odds(plane: _Shown, masks: Sequence[Mask], odds: Sequence[Image]) -> list[Image]:
+@dataclass(frozen=True)
+class _Known:
+    """Pixels of a view that certainly show one or the other, (h, w) bool."""
+
+    object: Mask
+    background: Mask
+
+
+def _known_pixels(plane: _Shown, masks: Sequence[Mask], odds: Sequence[Image]) -> list[_Known]:
+    """Pixels of the object and of the background of each view.
+
+    The object is known where the prediction of the plane fails or its texture is hidden, the
+    background about the object, where it shows the plane's texture or lies beyond the plane. Parts
+    of the object that the masks lack are neither.
+    """
+
+    def grown(mask: Mask, size: int) -> Mask:
+        return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+
+    found = []
+    for view, mask, odd, shown, hidden in zip(
+        plane.views, masks, odds, plane.shows_plane, plane.hidden, strict=True
+    ):
+        own = ~grown(~mask, TOL.window_px) & ((odd < -LEAST_ODDS) | hidden)
+        near = grown(mask, TOL.lighting_px(mask)) & ~grown(mask, TOL.window_px)
+        found.append(_Known(own, near & (shown | ~view.has_plane)))
+    return found
+
+
+def _learned_odds(
+    bins: Sequence[NDArray[np.int64]],
+    known: Sequence[_Known],
+    shares: Callable[[NDArray[np.int64]], Array],
+) -> list[Image]:
+    """Log-odds (h, w) that each view's pixels show the background, by their bins.
+
+    The bins of the object are those of all views, those of the background of each view.
+
+    Parameters
+    ----------
+    bins : of each view's pixels (h, w).
+    known : pixels of each view.
+    shares : of the bins, from those of some pixels.
+    """
+    of_object = shares(
+        np.concatenate([own[of.object] for own, of in zip(bins, known, strict=True)])
+    )
+    found = []
+    for own, of in zip(bins, known, strict=True):
+        ratio = np.log(shares(own[of.background]) / of_object)[own]
+        found.append(np.clip(ratio, -MAX_ODDS, MAX_ODDS).astype(np.float32))
+    return found
+
+
+def _appearance_odds(plane: _Shown, known: Sequence[_Known]) -> list[Image]:
     """Log-odds (h, w) that each view's pixels show the background, by their appearance.
 
-    Appearance is brightness and contrast. That of the object is known where the prediction of the
-    plane fails or its texture is hidden, in all views; that of the background in each view, about
-    the object, where it shows the plane's texture or lies beyond the plane. Parts of the object
-    that the masks lack are neither. Appearance tells where no other view predicts the plane: in
+    Appearance is brightness and contrast. It tells where no other view predicts the plane: in
     shadow under the object, and beyond the plane's extent.
     """
     views = plane.views
@@ -821,37 +918,68 @@ def _appearance_odds(plane: _Shown, masks: Sequence[Mask], odds: Sequence[Image]
         bright = (view.log - lowest) / spread
         # The least of the windows that contain a pixel: that of its own side of an outline.
         variance = cv2.erode(_local_variance(view.log, TOL.window_px), window)
-        contrast = np.sqrt(variance) + LEAST_SIGMA
-        rough = np.log(contrast / LEAST_SIGMA) / np.log(spread / LEAST_SIGMA)
-        a, b = (np.clip((x * num).astype(np.int64), 0, num - 1) for x in (bright, rough))
-        return np.asarray(a * num + b)
+        rough = _on_log_scale(np.sqrt(variance), spread)
+        return _levels(bright) * num + _levels(rough)
 
     def shares(of_pixels: NDArray[np.int64]) -> Array:
         counts = np.bincount(of_pixels, minlength=num * num).astype(np.float64)
         joint = ndimage.gaussian_filter(counts.reshape(num, num), 1.0)
         # Shadow, and light that is found nowhere else, change the brightness and not the contrast:
         # they are as likely as the rest.
-        counts = (joint + joint.mean(axis=0)).ravel()
-        # One in a hundred may look like anything; of nothing, all are as likely.
-        counts += max(0.01 * counts.sum(), 1.0) / counts.size
-        return np.asarray(counts / counts.sum())
+        return _likelihoods((joint + joint.mean(axis=0)).ravel())
 
-    def grown(mask: Mask, size: int) -> Mask:
-        return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    return _learned_odds([bins(view) for view in views], known, shares)
 
-    of_views = [bins(view) for view in views]
-    known = [
-        own[~grown(~mask, TOL.window_px) & ((odd < -LEAST_ODDS) | hidden)]
-        for own, mask, odd, hidden in zip(of_views, masks, odds, plane.hidden, strict=True)
-    ]
-    of_object = shares(np.concatenate(known))
-    found = []
-    for view, own, mask, shown in zip(views, of_views, masks, plane.shows_plane, strict=True):
-        near = grown(mask, TOL.lighting_px(mask)) & ~grown(mask, TOL.window_px)
-        near &= shown | ~view.has_plane
-        ratio = np.log(shares(own[near]) / of_object)[own]
-        found.append(np.clip(ratio, -MAX_ODDS, MAX_ODDS).astype(np.float32))
-    return found
+
+def _polarization_odds(plane: _Shown, known: Sequence[_Known]) -> list[Image]:
+    """Log-odds (h, w) that each view's pixels show the background, by their polarization.
+
+    The background's varies slowly: that of the plane with the angle at which it is seen. What
+    counts is the distance to its mean nearby, as far as that varies in the view.
+    """
+
+    def bins(view: _Working, of: _Known) -> NDArray[np.int64]:
+        measured = np.isfinite(view.polarization[..., 0])
+        away = np.zeros_like(view.log)
+        window = TOL.lighting_px(view.log)
+        for part in (view.has_plane, ~view.has_plane):
+            if not (beside := of.background & part & measured).any():
+                continue
+            mean = [
+                _local_mean(one, beside, window) for one in np.moveaxis(view.polarization, -1, 0)
+            ]
+            distance = lengths(view.polarization - np.stack(mean, axis=-1))
+            away = np.where(part, distance, away)
+        levels = _levels(_on_log_scale(away, 1.0))
+        return np.where(measured, levels, -1)
+
+    def shares(of_pixels: NDArray[np.int64]) -> Array:
+        counts = np.bincount(of_pixels[of_pixels >= 0], minlength=TOL.num_levels)
+        likelihoods = _likelihoods(ndimage.gaussian_filter1d(counts.astype(np.float64), 1.0))
+        return np.append(likelihoods, 1.0)  # what is not measured tells nothing
+
+    return _learned_odds(
+        [bins(view, of) for view, of in zip(plane.views, known, strict=True)], known, shares
+    )
+
+
+def _on_log_scale(values: Image, largest: float) -> Image:
+    """Places in [0, 1] of positive values between the least deviation and the largest."""
+    share = np.log(values / LEAST_SIGMA + 1) / np.log(largest / LEAST_SIGMA + 1)
+    return np.asarray(share, np.float32)
+
+
+def _levels(values: Image) -> NDArray[np.int64]:
+    """Numbers of the levels of values in [0, 1]."""
+    num = TOL.num_levels
+    return np.clip(np.nan_to_num(values * num).astype(np.int64), 0, num - 1)
+
+
+def _likelihoods(counts: Array) -> Array:
+    """Likelihoods of bins from their counts."""
+    # One in a hundred may look like anything; of nothing, all are as likely.
+    counts = counts + max(0.01 * counts.sum(), 1.0) / counts.size
+    return np.asarray(counts / counts.sum())
 
 
 def _odds(residual: Image, sigma: Image, spread: float) -> Image:
@@ -879,7 +1007,9 @@ def _found(
     size = (view.view.camera.width, view.view.camera.height)
     coarse = cv2.resize(signed_distance_px(mask), size) * np.float32(view.factor)
     behind = partial(_behind, views, index, plate, plane)
-    distance = find_outline(view.intensity, coarse, behind, noise, start_px=view.factor)
+    distance = find_outline(
+        view.intensity, coarse, behind, noise, polarized=view.polarized_light, start_px=view.factor
+    )
     found = distance < 0
     inner = coarse < -TOL.inner_share * max(coarse.shape)
     return FoundObject(found, smooth_distance_px(found) - distance, inner)

@@ -23,17 +23,19 @@ from traced_scenes import (
 )
 
 from polmvs.camera import pixel_centers
-from polmvs.geometry import unit
+from polmvs.geometry import lengths, unit
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.scene import View
+from polmvs.simulation.irradiance import bake
 from polmvs.simulation.lights import environment
 from polmvs.simulation.marks import marks_on
 from polmvs.simulation.materials import Material
 from polmvs.simulation.options import LightingOptions, LightName, Metal, Optics
 from polmvs.simulation.scene import MitsubaScene, SceneDescription, build_scene
 from polmvs.simulation.sensor import polarizer_images
+from polmvs.simulation.surroundings import Surrounding
 from polmvs.simulation.truth import true_maps
 from polmvs.synthetic.captures import look_at, render_view
 from polmvs.synthetic.surfaces import Plane, Sphere
@@ -182,6 +184,7 @@ def test_sky_alone_is_unpolarized(renderer):
             vertex_albedo=None,
             marks=marks_on(scaled("sphere"), 0, 0.01, 0),
             surroundings=[],
+            varnish=None,
             environment=environment(LightingOptions(light=light)),
             colour=False,
         )
@@ -214,3 +217,35 @@ def test_blur_of_an_edge_is_that_of_the_lens(renderer, blur, deviation_px):
     places = np.arange(len(steps)) - (steps * np.arange(len(steps))).sum()
     found = np.sqrt(max(0.0, (steps * places**2).sum()))
     assert found == pytest.approx(deviation_px, abs=0.3)
+
+
+@pytest.mark.parametrize("varnish", [Material(albedo=(0.05,) * 3, roughness=0.02, ior=1.5), None])
+def test_a_varnished_table_shines_as_an_object_of_that_material(renderer, varnish):
+    """Without varnish it is matte: unpolarized, of the brightness of its print."""
+    plane, view = scaled("plane"), view_of()
+    albedo = np.full((4, 4), 0.05, np.float32)
+    description = SceneDescription(
+        part=scaled("sphere", 0.001),
+        material=GLOSS,
+        vertex_albedo=None,
+        marks=marks_on(plane, 0, 0.01, 0),
+        surroundings=[
+            Surrounding(mesh=plane, uv=np.zeros((len(plane.vertices), 2), np.float32), print=albedo)
+        ],
+        varnish=varnish,
+        environment=environment(LightingOptions(light=LightName.EVEN)),
+        colour=False,
+    )
+    scene = build_scene(renderer, description)
+    bake(scene, bounces=1, samples=2048, spacing=0.05, seed=0)
+    found = stokes_of(scene, view)
+    as_object = lit_scene(renderer, plane, varnish or GLOSS)
+    _, _, mask = true_maps(as_object, view)
+    small = true_maps(scene, view)[2]
+    use = binary_erosion(mask & ~small, iterations=3)
+    assert use.sum() > 300
+    if varnish is None:
+        np.testing.assert_allclose(found[use] - (0.05, 0.0, 0.0), 0, atol=0.002)
+    else:
+        np.testing.assert_allclose(found[use], stokes_of(as_object, view)[use], atol=0.002)
+        assert np.median(lengths(found[use][:, 1:])) > 0.01

@@ -52,10 +52,17 @@ def known(behind: np.ndarray, *, until: float = np.inf) -> Background:
     return at
 
 
-def errors(image: np.ndarray, background: Background, *, start: float = 1.5) -> np.ndarray:
+def errors(
+    image: np.ndarray,
+    background: Background,
+    *,
+    start: float = 1.5,
+    polarized: np.ndarray | None = None,
+) -> np.ndarray:
     """Errors of the signed distance at the outline, px; the start is ``start`` px too wide."""
     coarse = (TRUTH - start).astype(np.float32)
-    found = find_outline(image, coarse, background, 0.01, start_px=2.0)
+    light = np.zeros((SIZE, SIZE, 2), np.float32) if polarized is None else polarized
+    found = find_outline(image, coarse, background, 0.01, polarized=light, start_px=2.0)
     return (found - TRUTH)[BORDER]
 
 
@@ -79,6 +86,20 @@ def test_what_is_as_bright_as_the_background_stays():
     behind = np.ones((FINER * SIZE, FINER * SIZE))
     error = errors(photograph(behind, behind), known(behind))
     assert np.median(error) == pytest.approx(-1.5, abs=0.3)
+
+
+@pytest.mark.parametrize("table", [0.0, 0.05])
+def test_polarization_shows_what_is_as_bright_as_the_background(table):
+    """The disc's light is polarized by 10 % along its outline; ``table`` is the background's."""
+    behind = np.ones((FINER * SIZE, FINER * SIZE))
+    around = np.arctan2(FINE_XY[..., 1] - CENTER[1], FINE_XY[..., 0] - CENTER[0])
+    own, seed = 0.1 * np.stack([np.cos(2 * around), np.sin(2 * around)]), 2
+    light = [photograph(one, np.full_like(behind, table)) for one in own]
+    light = np.dstack(light) + np.random.default_rng(seed).normal(scale=0.01, size=(SIZE, SIZE, 2))
+    error = errors(photograph(behind, behind), known(behind), polarized=light.astype(np.float32))
+    # Where it has the background's polarization, nothing tells; half of the outline is beyond that.
+    assert abs(np.median(error)) < 0.1
+    assert np.percentile(np.abs(error), 75) < 0.5
 
 
 def test_where_the_background_should_be_known_and_is_not_the_outline_stays():

@@ -179,6 +179,26 @@ def test_what_stands_before_a_wall_is_told_from_it(ball):
     assert min(overlaps) > 0.85
 
 
+def test_polarization_tells_what_is_as_bright_as_the_wall_behind_it():
+    """A polarized plane and a ball of a tenth along its outline, which is as bright as the wall."""
+    maps = []
+    for one in capture(printed(), ball=WALL, end=1.7, elevations=(10.0, 50.0)):
+        xy = pixel_centers(one.view.camera.width, one.view.camera.height)
+        center = one.view.project(CENTER)
+        around = np.arctan2(*np.moveaxis(xy - center, -1, 0)[::-1])
+        own = 0.1 * np.stack([np.cos(2 * around), np.sin(2 * around)], axis=-1)
+        light = np.where(on_ball(one.view, xy)[..., None], own, (0.04, 0.0))
+        light += np.random.default_rng(3).normal(scale=0.01, size=light.shape)
+        polarization = np.array(one.polarization)
+        polarization[..., :2] = light
+        maps.append(one.changed(polarization=polarization))
+    found = find_object(maps, TABLE, table_points())
+    assert found is not None
+    overlaps, places = compared(maps, found)
+    assert min(overlaps) > 0.85
+    assert np.median(np.abs(places)) < 0.4
+
+
 def test_a_top_as_bright_as_what_is_beyond_the_plane_stays():
     """Low views show it before the wall alone; the others know its brightness."""
     maps = capture(printed(), ball=0.6, cap=0.95, end=1.7, elevations=(10.0, 50.0))
@@ -250,6 +270,19 @@ def test_only_holes_that_show_the_plane_stay():
     expected = np.ones_like(mask)
     expected[:, 55:] = expected[through] = False
     np.testing.assert_array_equal(fill_false_holes(mask, odds), expected)
+
+
+def test_gloss_of_the_plane_does_not_prevent_the_search():
+    """Its brightness changes by a few percent over the image and from view to view."""
+    maps = []
+    for index, one in enumerate(capture(printed())):
+        xy = pixel_centers(one.view.camera.width, one.view.camera.height) / one.view.camera.width
+        wave = 0.1 * np.sin(4 * xy[..., 0] + 1.7 * index) * np.cos(3 * xy[..., 1] + index)
+        maps.append(one.changed(intensity=(one.intensity * np.exp(wave)).astype(np.float32)))
+    found = find_object(maps, TABLE, table_points())
+    assert found is not None
+    overlaps, _ = compared(maps, found)
+    assert np.median(overlaps) > 0.9
 
 
 def test_a_lamp_that_moves_with_the_camera_tells_nothing():
