@@ -789,7 +789,7 @@ def _by_texture(plane: _Shown, odds: Sequence[Image]) -> list[Image]:
     """Log-odds (h, w) that each view's pixels show the background, with its texture.
 
     Where a view does not show the plane's texture though it should, the brightness agrees by chance
-    only. Polarized regions show the object.
+    only. Polarized regions show the object, unless the plane is polarized like this as well.
     """
     found = []
     for view, own, seen, unseen in zip(
@@ -797,7 +797,8 @@ def _by_texture(plane: _Shown, odds: Sequence[Image]) -> list[Image]:
     ):
         total = np.where(seen, np.minimum(own + MAX_ODDS, MAX_ODDS), own)
         total[unseen] = np.minimum(total[unseen], -LEAST_ODDS)
-        total[view.polarized] = -MAX_ODDS
+        if not seen.any() or view.polarized[seen].mean() < np.exp(-MAX_ODDS):
+            total[view.polarized] = -MAX_ODDS
         found.append(total)
     return found
 

@@ -8,7 +8,7 @@ from analytic_objects import ring_of_views
 from scipy import ndimage
 
 from polmvs.camera import PinholeCamera, pixel_centers, sample_image
-from polmvs.geometry import lengths
+from polmvs.geometry import lengths, unit
 from polmvs.pipeline.stages.maps import hidden_plane
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import Region
@@ -283,6 +283,30 @@ def test_gloss_of_the_plane_does_not_prevent_the_search():
     assert found is not None
     overlaps, _ = compared(maps, found)
     assert np.median(overlaps) > 0.9
+
+
+def test_reflections_on_the_plane_that_are_polarized_are_not_the_ball(white):
+    """In each view behind the ball, up to its outline."""
+    maps, beside = [], []
+    for one in white:
+        xy = pixel_centers(one.view.camera.width, one.view.camera.height)
+        rays, center = one.view.rays_in_world(xy), one.view.center_in_world
+        meets = center - (center[2] / rays[..., 2])[..., None] * rays
+        away = unit(center[:2])  # it lies behind the ball
+        shown = (meets[..., :2] @ away < -0.3) & (lengths(meets) < 2) & ~on_ball(one.view, xy)
+        region = (on_ball(one.view, xy) & (xy[..., 0] % 40 < 30)) | shown
+        maps.append(one.changed(region=Region(region, region, ~region)))
+        beside.append(shown)
+    found = find_object(maps, TABLE, table_points())
+    assert found is not None
+    overlaps, _ = compared(maps, found)
+    assert np.median(overlaps) > 0.9
+    near = [np.abs(signed_distance_px(hiding.mask)) < 6 for hiding in found]
+    shares = [
+        hiding.mask[shown & band].mean()
+        for hiding, shown, band in zip(found, beside, near, strict=True)
+    ]
+    assert np.median(shares) < 0.1  # measured: 0.03; 0.29 if regions always show the object
 
 
 def test_a_lamp_that_moves_with_the_camera_tells_nothing():
