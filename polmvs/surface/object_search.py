@@ -25,7 +25,7 @@ from polmvs.camera import pixel_centers, sample_image
 from polmvs.config import default_num_workers
 from polmvs.fitting import MEDIAN_OF_NORMAL, robust_deviation
 from polmvs.geometry import lengths
-from polmvs.polarization.phase_map import PhaseMap, box_about
+from polmvs.polarization.phase_map import PhaseMap, box_about, smoothed_polarization
 from polmvs.scene import View
 from polmvs.surface.matting import find_outline
 from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
@@ -71,8 +71,8 @@ class SearchTolerances:
         object.
     polarized_share : of an object within its outline that is polarized if polarization shows all
         of it: its region is then complete. In the median view.
-    least_polarized_share : the same of a single view, and of its polarized region within the
-        outline. Guess.
+    most_beside : share of a single view's object that may lack polarization, and of its polarized
+        region that may lie beside the outline. Guess.
     """
 
     working_px: int = 640
@@ -91,7 +91,7 @@ class SearchTolerances:
     num_rounds: int = 2
     inner_share: float = 0.02
     polarized_share: float = 0.99
-    least_polarized_share: float = 0.9
+    most_beside: float = 0.1
 
     def lighting_px(self, image: Image | Mask) -> int:
         """Width of the window of :attr:`lighting_share`, pixels; odd."""
@@ -168,7 +168,7 @@ def find_object(
         return None
     masks = [_decided(*given) for given in zip(masks, odds, widths, strict=True)]
     noise = _residual(small, plates, masks)
-    odds = _by_texture(shown, _plane_odds(small, plates, noise))
+    odds = _by_texture(shown, _plane_odds(small, plates, noise), masks)
     masks = [fill_false_holes(*pair) for pair in zip(masks, odds, strict=True)]
     if _shadows_pass_for_objects(small, plates, noise):
         return None  # the lamp moves with the camera: outlines would be pixels wide
@@ -296,6 +296,8 @@ def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> 
     has_plane = np.asarray(np.isfinite(on_plane).all(axis=-1), np.bool_)
     measured = np.asarray(phase_map.polarization)
     light = np.where(np.isfinite(measured[..., 2:3]), measured[..., :2] * image[..., None], 0)
+    polarization = cv2.resize(smoothed_polarization(measured, BLUR_PX * factor), size)
+    polarization[polarization[..., 2] == 0] = np.nan
     return _Working(
         view=view,
         factor=factor,
@@ -303,22 +305,12 @@ def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> 
         polarized_light=light.astype(np.float32),
         lowest=lowest,
         log=log,
-        polarization=_smoothed_polarization(measured, size),
+        polarization=polarization[..., :2].astype(np.float32),
         region=region,
         polarized=polarized,
         on_plane=on_plane,
         has_plane=has_plane,
     )
-
-
-def _smoothed_polarization(measured: Image, size: tuple[int, int]) -> Image:
-    """``s1 / s0`` and ``s2 / s0`` in an image of some (width, height); NaN where unknown."""
-    known = np.isfinite(measured[..., 2]).astype(np.float32)[..., None]
-    values = np.where(known > 0, measured[..., :2], 0)
-    stack = cv2.resize(np.dstack([values, known]), size, interpolation=cv2.INTER_AREA)
-    stack = cv2.GaussianBlur(stack, (0, 0), BLUR_PX)
-    share = stack[..., 2:]
-    return np.where(share > 0.5, stack[..., :2] / np.maximum(share, 0.5), np.nan)
 
 
 def _on_plane(view: View, plane: SupportingPlane, xy: Floats) -> Array:
@@ -335,25 +327,33 @@ def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[i
     Outlines from polarization and from the plane differ in their bias. So all views are searched,
     or, if polarization shows the object in the median view, those in which it fails, or in which
     its region has grown over the background up to the image's border. A view whose polarized
-    region lies beside the mask has a wrong pose, and so would its search.
+    region lies beside the mask has a wrong pose, and so would its search; if the median view's
+    does, the plane is polarized, and polarization shows no outline.
     """
     shares, beside, grown = np.full(len(views), np.nan), *np.zeros((2, len(views)))
     for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
-        distance = signed_distance_px(mask)
-        reach = TOL.inner_share * max(mask.shape)
-        inner, outer = distance < -reach, distance > reach
+        inner = _well_beyond(~mask)
         if inner.any():
             shares[index] = view.region[inner].mean()
-        if view.polarized.any():
-            beside[index], grown[index] = outer[view.polarized].mean(), outer[view.region].mean()
+        beside[index] = _share_beside(view.polarized, mask)
+        grown[index] = _share_beside(view.region, mask)
     known = np.isfinite(shares)
     median = float(np.median(shares[known])) if known.any() else 0.0
     logger.info("%.1f %% of what hides its support is polarized.", 100 * median)
-    if median < TOL.polarized_share:
+    if median < TOL.polarized_share or np.median(beside) >= TOL.most_beside:
         return list(range(len(views)))
-    least = TOL.least_polarized_share
-    fails = (shares < least) | (grown >= 1 - least)
-    return np.flatnonzero(fails & (beside < 1 - least)).tolist()
+    fails = (shares < 1 - TOL.most_beside) | (grown >= TOL.most_beside)
+    return np.flatnonzero(fails & (beside < TOL.most_beside)).tolist()
+
+
+def _well_beyond(mask: Mask) -> Mask:
+    """Pixels (h, w) that lie outside of a mask for any outline of it."""
+    return np.asarray(signed_distance_px(mask) > TOL.inner_share * max(mask.shape))
+
+
+def _share_beside(region: Mask, mask: Mask) -> float:
+    """Share of a region that lies beside a mask; 0 without a region."""
+    return float(_well_beyond(mask)[region].mean()) if region.any() else 0.0
 
 
 def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
@@ -782,22 +782,22 @@ def _background_odds(
         odds = np.where(np.isfinite(plate.log), predicted[index], appearance[index])
         odds = np.clip(odds + polarization[index], -MAX_ODDS, MAX_ODDS)
         found.append(np.asarray(cv2.GaussianBlur(odds, (0, 0), BLUR_PX), np.float32))
-    return _by_texture(plane, found)
+    return _by_texture(plane, found, masks)
 
 
-def _by_texture(plane: _Shown, odds: Sequence[Image]) -> list[Image]:
+def _by_texture(plane: _Shown, odds: Sequence[Image], masks: Sequence[Mask]) -> list[Image]:
     """Log-odds (h, w) that each view's pixels show the background, with its texture.
 
     Where a view does not show the plane's texture though it should, the brightness agrees by chance
-    only. Polarized regions show the object, unless the plane is polarized like this as well.
+    only. Polarized regions show the object, unless they lie beside it as well.
     """
     found = []
-    for view, own, seen, unseen in zip(
-        plane.views, odds, plane.textured, plane.hidden, strict=True
+    for view, own, seen, unseen, mask in zip(
+        plane.views, odds, plane.textured, plane.hidden, masks, strict=True
     ):
         total = np.where(seen, np.minimum(own + MAX_ODDS, MAX_ODDS), own)
         total[unseen] = np.minimum(total[unseen], -LEAST_ODDS)
-        if not seen.any() or view.polarized[seen].mean() < np.exp(-MAX_ODDS):
+        if _share_beside(view.polarized, mask) < TOL.most_beside:
             total[view.polarized] = -MAX_ODDS
         found.append(total)
     return found
@@ -820,16 +820,17 @@ def _spread(views: Sequence[_Working]) -> float:
 def _shadows_pass_for_objects(
     views: Sequence[_Working], plates: Sequence[_Plate], noise: float
 ) -> bool:
-    """Whether shadows that move from view to view are too deep to pass for the plane.
+    """Whether shadows that move from view to view are too deep for a plane.
 
     The change of the plane's brightness over the image, from view to view, is about the share of
-    its light that moves, and so the depth of the shadows of this light.
+    its light that moves, and so the depth of the shadows of this light. In a shadow the plane is
+    polarized as elsewhere, which outweighs any evidence but the strongest.
     """
     changes = np.concatenate([plate.changes for plate in plates])
     if not len(changes):
         return True
     depth = np.median(changes, keepdims=True).astype(np.float32)
-    return bool(_odds(depth, np.full_like(depth, noise), _spread(views)) < 0)
+    return bool(_odds(depth, np.full_like(depth, noise), _spread(views)) <= -MAX_ODDS)
 
 
 def _decided(mask: Mask, odds: Image, width_px: float) -> Mask:
@@ -941,7 +942,7 @@ def _polarization_odds(plane: _Shown, known: Sequence[_Known]) -> list[Image]:
 
     def bins(view: _Working, of: _Known) -> NDArray[np.int64]:
         measured = np.isfinite(view.polarization[..., 0])
-        away = np.zeros_like(view.log)
+        away = np.full_like(view.log, np.nan)
         window = TOL.lighting_px(view.log)
         for part in (view.has_plane, ~view.has_plane):
             if not (beside := of.background & part & measured).any():
@@ -949,10 +950,8 @@ def _polarization_odds(plane: _Shown, known: Sequence[_Known]) -> list[Image]:
             mean = [
                 _local_mean(one, beside, window) for one in np.moveaxis(view.polarization, -1, 0)
             ]
-            distance = lengths(view.polarization - np.stack(mean, axis=-1))
-            away = np.where(part, distance, away)
-        levels = _levels(_on_log_scale(away, 1.0))
-        return np.where(measured, levels, -1)
+            away[part] = lengths(view.polarization - np.stack(mean, axis=-1))[part]
+        return np.where(np.isfinite(away), _levels(_on_log_scale(away, 1.0)), -1)
 
     def shares(of_pixels: NDArray[np.int64]) -> Array:
         counts = np.bincount(of_pixels[of_pixels >= 0], minlength=TOL.num_levels)
