@@ -72,7 +72,8 @@ class SearchTolerances:
     polarized_share : of an object within its outline that is polarized if polarization shows all
         of it: its region is then complete. In the median view.
     most_beside : share of a single view's object that may lack polarization, and of its polarized
-        region that may lie beside the outline. Guess.
+        region that may lie beside the outline, and of what lies there, that may show the plane's
+        texture. Guess.
     """
 
     working_px: int = 640
@@ -152,7 +153,7 @@ def find_object(
             return None
         masks = [coarse.mask(view) for view in small]
         # More than the object: if all of it is polarized, the object is. Half the size shows that.
-        if not _views_to_search(small, masks):
+        if not _views_to_search(small, masks, shown.textured):
             return None
         cells = coarse.finer()
     for _ in range(TOL.num_rounds):
@@ -163,7 +164,7 @@ def find_object(
             return None
         masks = [left.mask(view) for view in small]
         widths = [left.width_px(view) for view in small]
-    searched = _views_to_search(small, masks)
+    searched = _views_to_search(small, masks, shown.textured)
     if not searched:
         return None
     masks = [_decided(*given) for given in zip(masks, odds, widths, strict=True)]
@@ -238,7 +239,7 @@ class _Working:
     view : in its own pixels.
     factor : of its own pixels to a working one.
     intensity : (H, W) float32, in its own pixels.
-    polarized_light : (H, W, 2) float32, ``s1`` and ``s2``; 0 where they are not measured.
+    measured : (H, W, 4) float32, ``s1 / s0`` and ``s2 / s0`` as of the phase map, with variances.
     lowest : intensity whose logarithm is the lowest.
     log : (h, w) float32, logarithm of the intensity.
     polarization : (h, w, 2) float32, ``s1 / s0`` and ``s2 / s0``; NaN where they are not measured.
@@ -251,7 +252,7 @@ class _Working:
     view: View
     factor: float
     intensity: Image
-    polarized_light: Image
+    measured: Image
     lowest: float
     log: Image
     polarization: Image
@@ -295,14 +296,13 @@ def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> 
     on_plane = _on_plane(view, plane, pixel_centers(*size) * factor)
     has_plane = np.asarray(np.isfinite(on_plane).all(axis=-1), np.bool_)
     measured = np.asarray(phase_map.polarization)
-    light = np.where(np.isfinite(measured[..., 2:3]), measured[..., :2] * image[..., None], 0)
     polarization = cv2.resize(smoothed_polarization(measured, BLUR_PX * factor), size)
     polarization[polarization[..., 2] == 0] = np.nan
     return _Working(
         view=view,
         factor=factor,
         intensity=image,
-        polarized_light=light.astype(np.float32),
+        measured=measured,
         lowest=lowest,
         log=log,
         polarization=polarization[..., :2].astype(np.float32),
@@ -321,26 +321,31 @@ def _on_plane(view: View, plane: SupportingPlane, xy: Floats) -> Array:
     return np.asarray(center + np.where(ranges > 0, ranges, np.nan)[..., None] * rays)
 
 
-def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[int]:
+def _views_to_search(
+    views: Sequence[_Working], masks: Sequence[Mask], textured: Sequence[Mask]
+) -> list[int]:
     """Views in which polarization does not show what is well within some masks.
 
     Outlines from polarization and from the plane differ in their bias. So all views are searched,
     or, if polarization shows the object in the median view, those in which it fails, or in which
     its region has grown over the background up to the image's border. A view whose polarized
-    region lies beside the mask has a wrong pose, and so would its search; if the median view's
-    does, the plane is polarized, and polarization shows no outline.
+    region lies beside the mask has a wrong pose, and so would its search. If the median view's does
+    and shows the plane's texture there, the plane is polarized, and polarization shows no outline.
     """
-    shares, beside, grown = np.full(len(views), np.nan), *np.zeros((2, len(views)))
-    for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
+    shares, beside, grown, of_plane = np.full(len(views), np.nan), *np.zeros((3, len(views)))
+    for index, (view, mask, texture) in enumerate(zip(views, masks, textured, strict=True)):
         inner = _well_beyond(~mask)
         if inner.any():
             shares[index] = view.region[inner].mean()
         beside[index] = _share_beside(view.polarized, mask)
         grown[index] = _share_beside(view.region, mask)
+        if (away := view.polarized & _well_beyond(mask)).any():
+            of_plane[index] = texture[away].mean()
     known = np.isfinite(shares)
     median = float(np.median(shares[known])) if known.any() else 0.0
     logger.info("%.1f %% of what hides its support is polarized.", 100 * median)
-    if median < TOL.polarized_share or np.median(beside) >= TOL.most_beside:
+    is_plane = min(np.median(beside), np.median(of_plane)) >= TOL.most_beside
+    if median < TOL.polarized_share or is_plane:
         return list(range(len(views)))
     fails = (shares < 1 - TOL.most_beside) | (grown >= TOL.most_beside)
     return np.flatnonzero(fails & (beside < TOL.most_beside)).tolist()
@@ -1007,8 +1012,16 @@ def _found(
     size = (view.view.camera.width, view.view.camera.height)
     coarse = cv2.resize(signed_distance_px(mask), size) * np.float32(view.factor)
     behind = partial(_behind, views, index, plate, plane)
+    # Clipped light has no known polarization; 0 on both sides of an outline tells nothing.
+    known = np.isfinite(view.measured[..., 2:3])
+    polarized = np.where(known, view.measured[..., :2] * view.intensity[..., None], 0)
     distance = find_outline(
-        view.intensity, coarse, behind, noise, polarized=view.polarized_light, start_px=view.factor
+        view.intensity,
+        coarse,
+        behind,
+        noise,
+        polarized=polarized.astype(np.float32),
+        start_px=view.factor,
     )
     found = distance < 0
     inner = coarse < -TOL.inner_share * max(coarse.shape)
