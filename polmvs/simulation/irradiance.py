@@ -45,7 +45,8 @@ def bake(scene: MitsubaScene, *, bounces: int, samples: int, spacing: float, see
             continue
         vertices, normals = mesh.vertices, mesh.normals
         chosen = _representatives(vertices, normals, spacing) if is_part else slice(None)
-        ior = material.ior if is_part else None if varnish is None else varnish.ior
+        coat = material if is_part else varnish
+        ior = None if coat is None else coat.ior
         light = _Gathering(scene=scene, ior=ior, bounces=bounces, samples=samples)
         gathered = light.at(vertices[chosen], normals[chosen], seed + index)
         if is_part:

@@ -242,7 +242,6 @@ class _Working:
     measured : (H, W, 4) float32, ``s1 / s0`` and ``s2 / s0`` as of the phase map, with variances.
     lowest : intensity whose logarithm is the lowest.
     log : (h, w) float32, logarithm of the intensity.
-    polarization : (h, w, 2) float32, ``s1 / s0`` and ``s2 / s0``; NaN where they are not measured.
     region : (h, w) bool, its polarized region.
     polarized : (h, w) bool, the region without what may be background up to the image's border.
     on_plane : (h, w, 3), where each pixel's ray meets the plane; NaN where it does not.
@@ -255,7 +254,6 @@ class _Working:
     measured: Image
     lowest: float
     log: Image
-    polarization: Image
     region: Mask
     polarized: Mask
     on_plane: Array
@@ -264,6 +262,14 @@ class _Working:
     @property
     def center(self) -> Array:
         return self.view.center_in_world
+
+    @cached_property
+    def polarization(self) -> Image:
+        """(h, w, 2), ``s1 / s0`` and ``s2 / s0``; NaN where they are not measured."""
+        smoothed = smoothed_polarization(self.measured, BLUR_PX * self.factor)
+        small = cv2.resize(smoothed, self.log.shape[::-1])
+        known = small[..., 2:] > 0
+        return np.where(known, small[..., :2], np.nan).astype(np.float32)
 
     def project(self, points: Floats) -> Floats:
         """Working coordinates ``(..., 2)``."""
@@ -296,20 +302,8 @@ def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> 
     on_plane = _on_plane(view, plane, pixel_centers(*size) * factor)
     has_plane = np.asarray(np.isfinite(on_plane).all(axis=-1), np.bool_)
     measured = np.asarray(phase_map.polarization)
-    polarization = cv2.resize(smoothed_polarization(measured, BLUR_PX * factor), size)
-    polarization[polarization[..., 2] == 0] = np.nan
     return _Working(
-        view=view,
-        factor=factor,
-        intensity=image,
-        measured=measured,
-        lowest=lowest,
-        log=log,
-        polarization=polarization[..., :2].astype(np.float32),
-        region=region,
-        polarized=polarized,
-        on_plane=on_plane,
-        has_plane=has_plane,
+        view, factor, image, measured, lowest, log, region, polarized, on_plane, has_plane
     )
 
 
@@ -334,18 +328,17 @@ def _views_to_search(
     """
     shares, beside, grown, of_plane = np.full(len(views), np.nan), *np.zeros((3, len(views)))
     for index, (view, mask, texture) in enumerate(zip(views, masks, textured, strict=True)):
-        inner = _well_beyond(~mask)
+        inner, outer = _well_beyond(~mask), _well_beyond(mask)
         if inner.any():
             shares[index] = view.region[inner].mean()
-        beside[index] = _share_beside(view.polarized, mask)
-        grown[index] = _share_beside(view.region, mask)
-        if (away := view.polarized & _well_beyond(mask)).any():
-            of_plane[index] = texture[away].mean()
+        beside[index] = _share(outer, view.polarized)
+        grown[index] = _share(outer, view.region)
+        of_plane[index] = _share(texture, view.polarized & outer)
     known = np.isfinite(shares)
     median = float(np.median(shares[known])) if known.any() else 0.0
     logger.info("%.1f %% of what hides its support is polarized.", 100 * median)
-    is_plane = min(np.median(beside), np.median(of_plane)) >= TOL.most_beside
-    if median < TOL.polarized_share or is_plane:
+    plane_is_polarized = min(np.median(beside), np.median(of_plane)) >= TOL.most_beside
+    if median < TOL.polarized_share or plane_is_polarized:
         return list(range(len(views)))
     fails = (shares < 1 - TOL.most_beside) | (grown >= TOL.most_beside)
     return np.flatnonzero(fails & (beside < TOL.most_beside)).tolist()
@@ -356,9 +349,9 @@ def _well_beyond(mask: Mask) -> Mask:
     return np.asarray(signed_distance_px(mask) > TOL.inner_share * max(mask.shape))
 
 
-def _share_beside(region: Mask, mask: Mask) -> float:
-    """Share of a region that lies beside a mask; 0 without a region."""
-    return float(_well_beyond(mask)[region].mean()) if region.any() else 0.0
+def _share(marked: Mask, region: Mask) -> float:
+    """Share of a region's pixels that are marked; 0 without a region."""
+    return float(marked[region].mean()) if region.any() else 0.0
 
 
 def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
@@ -802,7 +795,7 @@ def _by_texture(plane: _Shown, odds: Sequence[Image], masks: Sequence[Mask]) -> 
     ):
         total = np.where(seen, np.minimum(own + MAX_ODDS, MAX_ODDS), own)
         total[unseen] = np.minimum(total[unseen], -LEAST_ODDS)
-        if _share_beside(view.polarized, mask) < TOL.most_beside:
+        if _share(_well_beyond(mask), view.polarized) < TOL.most_beside:
             total[view.polarized] = -MAX_ODDS
         found.append(total)
     return found
