@@ -47,6 +47,7 @@ from polmvs.simulation.mesh_input import ObjectMesh, object_mesh
 from polmvs.simulation.options import (
     LightName,
     ObjectOptions,
+    Scenery,
     SensorKind,
     SensorOptions,
     Simulation,
@@ -212,6 +213,12 @@ class _Plan:
         vertices = mesh.mesh.vertices
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         size = float((high - low).max())
+        if not high[2] > low[2] and options.scenery.surroundings is not Scenery.NOTHING:
+            raise DataError(
+                mesh.source,
+                "is flat, so it would lie within the table. Turn it upright, give it a thickness, "
+                "or set `scenery.surroundings` to nothing.",
+            )
         target = 0.5 * (low + high)
         seed = options.rendering.seed
         pinhole = pinhole_of(camera)

@@ -184,6 +184,15 @@ def test_what_cannot_be_rendered_is_refused(renderer, tmp_path, changes, message
     assert not (tmp_path / "c").exists()
 
 
+def test_a_flat_mesh_is_no_object_on_a_table(renderer, tmp_path):
+    sheet = "v 0 0 3\nv 1 0 3\nv 0 1 3\nf 1 2 3\n"
+    (tmp_path / "sheet.obj").write_text(sheet)
+    with pytest.raises(DataError, match=r"sheet\.obj: is flat"):
+        polmvs.simulate(tmp_path / "sheet.obj", tmp_path / "c", **SMALL)
+    options = {**SMALL, "views": 1, "image_size": (48, 40), "surroundings": "nothing", "marks": 0}
+    polmvs.simulate(tmp_path / "sheet.obj", tmp_path / "c", **options, size=0.1)
+
+
 def test_a_capture_is_replaced_only_by_one_that_can_be_rendered(renderer, tmp_path):
     (tmp_path / "away.txt").write_text("a 1 0 0 0 0 0 -9\n")
     options = {**SMALL, "image_size": (48, 40), "views": 1, "surroundings": "nothing"}
