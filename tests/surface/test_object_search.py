@@ -314,6 +314,21 @@ def test_a_lamp_that_moves_with_the_camera_tells_nothing():
     assert find_object(capture(printed(), lamp=True), TABLE, table_points()) is None
 
 
+@pytest.mark.parametrize(("dolp", "is_searched"), [(0.0, False), (0.006, True)])
+def test_an_object_without_polarization_is_refused(white, caplog, dolp, is_searched):
+    """Its outline alone would pass for a surface. Noise is no polarization."""
+    rng = np.random.default_rng(4)
+    sigma = 0.025  # of a pixel; of the average over a window a tenth of it
+    maps = []
+    for one in white:
+        polarization = np.full((*one.intensity.shape, 4), sigma**2, np.float32)
+        polarization[..., 3] = 0
+        polarization[..., :2] = rng.normal((dolp, 0.0), sigma, (*one.intensity.shape, 2))
+        maps.append(one.changed(polarization=polarization))
+    assert (hidden_plane(maps, tracks_on_table()) is not None) == is_searched
+    assert ("hardly polarized" in caplog.text) == (not is_searched)
+
+
 @pytest.mark.slow
 def test_what_polarization_shows_is_left_to_it(white):
     tracks = tracks_on_table()

@@ -47,7 +47,9 @@ from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
-MIN_DOLP_SIGMAS = 3.0  # of the median pixel of an object; white plastic in a studio has 12
+# Of the median pixel of an object: that of Rice's distribution where the polarization equals its
+# deviation (without any: 1.18). White plastic in a studio has 12.
+MIN_DOLP_SIGMAS = 1.48
 DOLP_WINDOW_PX = 3.0
 MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are held together
 
@@ -258,7 +260,16 @@ def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject |
         for one, hiding in zip(maps, found, strict=True)
         if hiding is not None
     ]
-    return found if float(np.median(strengths)) > MIN_DOLP_SIGMAS else None
+    if (strength := float(np.median(strengths))) > MIN_DOLP_SIGMAS:
+        return found
+    logger.warning(
+        "An object stands on the plane, but its light is hardly polarized: the median DoLP is %.1f "
+        "standard deviations (needed: %.1f). Only what polarization shows is reconstructed. Expose "
+        "longer, or average frames.",
+        strength,
+        MIN_DOLP_SIGMAS,
+    )
+    return None
 
 
 def _dolp_in_sigmas(phase_map: PhaseMap, where: NDArray[np.bool_]) -> float:
