@@ -213,7 +213,7 @@ class _Plan:
         vertices = mesh.mesh.vertices
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         size = float((high - low).max())
-        if not high[2] > low[2] and options.scenery.surroundings is not Scenery.NOTHING:
+        if high[2] <= low[2] and options.scenery.surroundings is not Scenery.NOTHING:
             raise DataError(
                 mesh.source,
                 "is flat, so it would lie within the table. Turn it upright, give it a thickness, "

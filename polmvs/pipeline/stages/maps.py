@@ -47,8 +47,8 @@ from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
-# Of the median pixel of an object: that of Rice's distribution where the polarization equals its
-# deviation (without any: 1.18). White plastic in a studio has 12.
+# Least median of an object's DoLP over its standard deviation: the median of Rice's distribution
+# whose true DoLP equals the deviation. Unpolarized light has 1.18, white plastic in a studio 12.
 MIN_DOLP_SIGMAS = 1.48
 DOLP_WINDOW_PX = 3.0
 MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are held together
