@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from polmvs.arrays import Array
 from polmvs.colmap.dense_workspace import MatchTolerances
 from polmvs.errors import DataError
+from polmvs.geometry import lengths
 from polmvs.polarization.capture import WHITE_PERCENTILE, Capture, intensity_image_8bit
 from polmvs.scene import View, evenly_spread
 
@@ -194,6 +195,11 @@ def _consistent_matches(
         return None
     a = first[0][[m.queryIdx for m in best.values()]]
     b = second[0][[m.trainIdx for m in best.values()]]
+    # Before a turntable the background stays in place: it tells nothing about the cameras.
+    moved = lengths(a - b) > t.epipolar_px
+    a, b = a[moved], b[moved]
+    if len(a) < t.min_matches:
+        return None
     cv2.setRNGSeed(0)
     _, inside = cv2.findFundamentalMat(a, b, cv2.FM_RANSAC, t.epipolar_px, 0.999, 2000)
     kept = np.ravel(inside) == 1  # None where no geometry fits

@@ -1,9 +1,10 @@
-"""The object in each view, found by the textured plane that it hides.
+"""The objects in each view, found by the textured plane that they hide.
 
 Polarization does not show the outline of grey and white objects. The plane on which they stand
 does, if it has a texture: its image in one view is predicted from the others. Pixels that agree
 with the prediction show the plane, so the space between it and the camera is free. Where there is
-no prediction, brightness and contrast decide. The remaining space above the plane is the object.
+no prediction, brightness and contrast decide. The remaining space above the plane is the object
+where the cameras look, with others beside it that are polarized.
 The outline in each view is where the image changes from the predicted plane to the brightness of
 the object, as in matting against a known background.
 """
@@ -25,7 +26,14 @@ from polmvs.camera import pixel_centers, sample_image
 from polmvs.config import default_num_workers
 from polmvs.fitting import MEDIAN_OF_NORMAL, robust_deviation
 from polmvs.geometry import lengths
-from polmvs.polarization.phase_map import PhaseMap, box_about, smoothed_polarization
+from polmvs.polarization.phase_map import (
+    MIN_DOLP_SIGMAS,
+    PhaseMap,
+    box_about,
+    dolp_in_sigmas,
+    median_strength,
+    smoothed_polarization,
+)
 from polmvs.scene import View
 from polmvs.surface.matting import find_outline
 from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
@@ -66,6 +74,8 @@ class SearchTolerances:
     seen_share : share of the views that must see a point; the objects lie in the common field of
         view.
     num_cells : of the coarse grid, along its side; the fine one has as many along the object's.
+    least_part : volume of another object at least, a share of that of the object in the middle. As
+        that of a piece of the hull (:class:`polmvs.surface.visual_hull.HullTolerances`).
     num_rounds : of prediction and carving; a third changes the outlines by 0.1 px.
     inner_share : of an image's longest side, distance from the outline of what is well within the
         object.
@@ -89,6 +99,7 @@ class SearchTolerances:
     wrong_share: float = 0.25
     seen_share: float = 0.6
     num_cells: int = 72
+    least_part: float = 0.01
     num_rounds: int = 2
     inner_share: float = 0.02
     polarized_share: float = 0.99
@@ -144,11 +155,12 @@ def find_object(
     near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
     # A plane without fine texture may have a coarse one.
     shown = _shown_plane(maps, plane, near, 4, None)
+    strengths = [dolp_in_sigmas(one) for one in maps]
     for scale in (2, 1):
         shown = _shown_plane(maps, plane, near, scale, shown)
         small = _with_extent(shown.views, shown.textured, plane)
         shown = replace(shown, views=small)
-        coarse = _bounded(_space(small, plane), small, shown.shows_plane)
+        coarse = _bounded(_space(small, plane), small, shown.shows_plane, strengths)
         if coarse is None:
             return None
         masks = [coarse.mask(view) for view in small]
@@ -448,7 +460,7 @@ class _Cells:
         needed: int,
         testable: Sequence[Mask] | None = None,
     ) -> _Cells | None:
-        """The cells without those that some views see through; only the part around the middle.
+        """The cells without those that some views see through.
 
         Parameters
         ----------
@@ -472,7 +484,7 @@ class _Cells:
         held[self.held] = (
             (num_free < needed) & (num_seen >= TOL.seen_share * len(views)) & (num_tests >= 2)
         )
-        return self._middle_part(held)
+        return replace(self, held=held) if held.any() else None
 
     def likely(self, views: Sequence[_Working], odds: Sequence[Image]) -> _Cells | None:
         """The cells that are more likely the object's.
@@ -520,16 +532,19 @@ class _Cells:
         """Width of a cell at their middle in a view, working pixels."""
         return float(lengths(self.axes).max()) / view.pixel_at(float(view.view.ranges(self.middle)))
 
-    def _middle_part(self, held: Mask) -> _Cells | None:
-        """The connected part of some cells around the middle; None if there is none."""
-        parts, num = ndimage.label(held)
-        if not num:
-            return None
+    def parts(self) -> list[_Cells]:
+        """The connected parts, the one around the middle first, then by size."""
+        parts, num = ndimage.label(self.held)
         # The middle of the grid is where the cameras look: the part with most cells about it.
-        x, y, _ = np.meshgrid(*(np.linspace(-1, 1, n) for n in held.shape), indexing="ij")
+        x, y, _ = np.meshgrid(*(np.linspace(-1, 1, n) for n in self.held.shape), indexing="ij")
         nearness = ndimage.sum(np.exp(-8 * (x * x + y * y)), parts, np.arange(num + 1))
-        nearness[0] = 0
-        return replace(self, held=np.asarray(parts == np.argmax(nearness)))
+        size = np.bincount(parts.ravel(), minlength=num + 1)
+        nearness[0] = size[0] = 0
+        middle = int(np.argmax(nearness))
+        order = np.argsort(-size[1:], kind="stable") + 1
+        least = TOL.least_part * size[middle]
+        others = [number for number in order if number != middle and size[number] >= least]
+        return [replace(self, held=parts == number) for number in (middle, *others)]
 
     @property
     def ends_at_sides(self) -> bool:
@@ -591,18 +606,46 @@ def _space(views: Sequence[_Working], plane: SupportingPlane) -> _Cells:
     return _Cells(origin, axes, np.ones(shape, bool))
 
 
-def _bounded(space: _Cells, views: Sequence[_Working], free: Sequence[Mask]) -> _Cells | None:
-    """The part around the middle that remains, if it ends within the space.
+def _bounded(
+    space: _Cells, views: Sequence[_Working], free: Sequence[Mask], strengths: Sequence[Image]
+) -> _Cells | None:
+    """The part around the middle that remains, if it ends within the space, and other objects.
 
     A view may deny a point wrongly, so others must deny it as well. Among clutter fewer views see
     the plane; if the remaining part does not end, one view is enough.
+
+    Parameters
+    ----------
+    strengths : of each view, as of :func:`polmvs.polarization.phase_map.dolp_in_sigmas`.
     """
     testable = [view.has_plane for view in views]
     for needed in (TOL.needed(len(views)), 1):
         left = space.carved(views, free, needed=needed, testable=testable)
-        if left is not None and not left.ends_at_sides:
-            return left
+        if left is None:
+            continue
+        middle, *others = left.parts()
+        if not middle.ends_at_sides:
+            ending = [part for part in others if not part.ends_at_sides]
+            return _with_polarized(middle, ending, views, strengths)
     return None
+
+
+def _with_polarized(
+    middle: _Cells, others: Sequence[_Cells], views: Sequence[_Working], strengths: Sequence[Image]
+) -> _Cells:
+    """A part with those of the others that are polarized where no larger one lies before them."""
+    covered = [middle.mask(view) for view in views]
+    for part in others:
+        own = [part.mask(view) & ~other for view, other in zip(views, covered, strict=True)]
+        of_views = [
+            median_strength(image, cv2.resize(mask.astype(np.uint8), image.shape[::-1]) > 0)
+            for mask, image in zip(own, strengths, strict=True)
+            if mask.any()
+        ]
+        if of_views and np.median(of_views) > MIN_DOLP_SIGMAS:
+            middle = replace(middle, held=middle.held | part.held)
+            covered = [mask | other for mask, other in zip(own, covered, strict=True)]
+    return middle
 
 
 def _with_extent(

@@ -92,6 +92,22 @@ def test_cameras_of_the_images_fit_and_those_of_others_do_not(
         require_cameras_of_images(others, matches, "cameras.txt", "Give others.")
 
 
+def test_a_background_that_stays_in_place_tells_nothing(
+    printed: tuple[list[View], Images],
+) -> None:
+    """As behind a turntable, before which the camera stands still."""
+    views, images = printed
+    wall = np.random.default_rng(0).integers(0, 255, (50, 30)).astype(np.uint8)
+    wall = np.kron(wall, np.ones((5, 5), np.uint8))  # half as wide as the images
+    behind = {n: np.hstack([wall, image[:, wall.shape[1] :]]) for n, image in images.items()}
+    fit = fit_to_images(views, ImageMatches(behind.__getitem__))
+    assert fit.num_matches > 40
+    assert fit.fitting > 0.95
+    only = fit_to_images(views, ImageMatches(lambda name: images[views[0].name]))
+    assert only.num_matches == 0
+    assert only.fits is None
+
+
 @pytest.mark.parametrize(
     "image_of",
     [

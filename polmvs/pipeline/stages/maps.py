@@ -32,11 +32,13 @@ from polmvs.polarization.capture import Capture
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.mask_check import MAX_CUT_SHARE, cut_share
 from polmvs.polarization.phase_map import (
+    MIN_DOLP_SIGMAS,
     PhaseMap,
     as_tilted,
     build_phase_map,
+    dolp_in_sigmas,
+    median_strength,
     open_phase_map,
-    smoothed_polarization,
     store_phase_map,
     turned,
 )
@@ -47,10 +49,6 @@ from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
-# Least median of an object's DoLP over its standard deviation: the median of Rice's distribution
-# whose true DoLP equals the deviation. Unpolarized light has 1.18, white plastic in a studio 12.
-MIN_DOLP_SIGMAS = 1.48
-DOLP_WINDOW_PX = 3.0
 MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are held together
 
 
@@ -256,7 +254,7 @@ def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject |
         return found
     # Without any phase, its outline alone would pass for a surface.
     strengths = [
-        _dolp_in_sigmas(one, hiding.inner)
+        median_strength(dolp_in_sigmas(one), hiding.inner)
         for one, hiding in zip(maps, found, strict=True)
         if hiding is not None
     ]
@@ -270,16 +268,6 @@ def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject |
         MIN_DOLP_SIGMAS,
     )
     return None
-
-
-def _dolp_in_sigmas(phase_map: PhaseMap, where: NDArray[np.bool_]) -> float:
-    """Median DoLP of some pixels over its standard deviation; 0 of none."""
-    smoothed = smoothed_polarization(np.asarray(phase_map.polarization), DOLP_WINDOW_PX)[where]
-    known = smoothed[..., 2] > 0
-    if not known.any():
-        return 0.0
-    dolp = np.hypot(smoothed[..., 0], smoothed[..., 1])[known]
-    return float(np.median(dolp / np.sqrt(smoothed[..., 2][known])))
 
 
 @dataclass(frozen=True)
