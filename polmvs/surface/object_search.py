@@ -4,7 +4,7 @@ Polarization does not show the outline of grey and white objects. The plane on w
 does, if it has a texture: its image in one view is predicted from the others. Pixels that agree
 with the prediction show the plane, so the space between it and the camera is free. Where there is
 no prediction, brightness and contrast decide. The remaining space above the plane is the object
-where the cameras look, with others beside it that are polarized.
+where the cameras look, with others beside it that are polarized and as poor in features as it.
 The outline in each view is where the image changes from the predicted plane to the brightness of
 the object, as in matting against a known background.
 """
@@ -34,7 +34,7 @@ from polmvs.polarization.phase_map import (
     median_strength,
     smoothed_polarization,
 )
-from polmvs.scene import View
+from polmvs.scene import Tracks, View
 from polmvs.surface.matting import find_outline
 from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
 from polmvs.surface.visual_hull import SupportingPlane
@@ -137,30 +137,35 @@ class FoundObject:
 def find_object(
     maps: Sequence[PhaseMap],
     plane: SupportingPlane,
-    points: Floats,
+    tracks: Tracks,
 ) -> list[FoundObject | None] | None:
-    """The object that stands on a plane, in each view.
+    """The objects that stand on a plane, in each view.
 
     Parameters
     ----------
     maps : of each view, three or more; a polarized region shows the object, not the plane.
-    plane : on which the object stands.
-    points : (N, 3), sparse points of the scene.
+    plane : on which they stand.
+    tracks : sparse points of the scene.
 
     Returns
     -------
     None for a view whose outline polarization shows. None for all if it does in every view, if the
     plane has too little texture to find what hides it, or if its light moves.
     """
+    points = tracks.points_in_world
     near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
     # A plane without fine texture may have a coarse one.
     shown = _shown_plane(maps, plane, near, 4, None)
     strengths = [dolp_in_sigmas(one) for one in maps]
+    features = [tracks.obs_xy[seen] for seen in tracks.of_views(len(maps))]
     for scale in (2, 1):
         shown = _shown_plane(maps, plane, near, scale, shown)
         small = _with_extent(shown.views, shown.textured, plane)
         shown = replace(shown, views=small)
-        coarse = _bounded(_space(small, plane), small, shown.shows_plane, strengths)
+        clues = [
+            _Clues(*own) for own in zip(small, shown.shows_plane, strengths, features, strict=True)
+        ]
+        coarse = _bounded(_space(small, plane), clues)
         if coarse is None:
             return None
         masks = [coarse.mask(view) for view in small]
@@ -553,6 +558,11 @@ class _Cells:
         sides = (held[0], held[-1], held[:, 0], held[:, -1], held[:, :, -1])
         return any(side.any() for side in sides)
 
+    @property
+    def stands(self) -> bool:
+        """Whether the part reaches the plane."""
+        return bool(self.held[:, :, 0].any())
+
     def finer(self) -> _Cells:
         """The part, with a margin of one cell, on a finer grid."""
         inside = np.argwhere(self.held)
@@ -606,18 +616,13 @@ def _space(views: Sequence[_Working], plane: SupportingPlane) -> _Cells:
     return _Cells(origin, axes, np.ones(shape, bool))
 
 
-def _bounded(
-    space: _Cells, views: Sequence[_Working], free: Sequence[Mask], strengths: Sequence[Image]
-) -> _Cells | None:
+def _bounded(space: _Cells, clues: Sequence[_Clues]) -> _Cells | None:
     """The part around the middle that remains, if it ends within the space, and other objects.
 
     A view may deny a point wrongly, so others must deny it as well. Among clutter fewer views see
     the plane; if the remaining part does not end, one view is enough.
-
-    Parameters
-    ----------
-    strengths : of each view, as of :func:`polmvs.polarization.phase_map.dolp_in_sigmas`.
     """
+    views, free = [one.view for one in clues], [one.shows_plane for one in clues]
     testable = [view.has_plane for view in views]
     for needed in (TOL.needed(len(views)), 1):
         left = space.carved(views, free, needed=needed, testable=testable)
@@ -625,24 +630,64 @@ def _bounded(
             continue
         middle, *others = left.parts()
         if not middle.ends_at_sides:
-            ending = [part for part in others if not part.ends_at_sides]
-            return _with_polarized(middle, ending, views, strengths)
+            standing = [part for part in others if part.stands and not part.ends_at_sides]
+            return _with_objects(middle, standing, clues)
     return None
 
 
-def _with_polarized(
-    middle: _Cells, others: Sequence[_Cells], views: Sequence[_Working], strengths: Sequence[Image]
-) -> _Cells:
-    """A part with those of the others that are polarized where no larger one lies before them."""
-    covered = [middle.mask(view) for view in views]
+@dataclass(frozen=True)
+class _Clues:
+    """What tells in a view whether a part is an object.
+
+    Attributes
+    ----------
+    view : in working pixels.
+    shows_plane : (h, w) bool.
+    strengths : (H, W), as of :func:`polmvs.polarization.phase_map.dolp_in_sigmas`.
+    features : (O, 2) image coordinates of sparse points.
+    """
+
+    view: _Working
+    shows_plane: Mask
+    strengths: Image
+    features: Floats
+
+    def mask(self, part: _Cells) -> Mask:
+        """What a part covers, without what shows the plane."""
+        return part.mask(self.view) & ~self.shows_plane
+
+    def strength(self, mask: Mask) -> float:
+        """Median strength of the polarization of some working pixels."""
+        large = cv2.resize(mask.astype(np.uint8), self.strengths.shape[::-1]) > 0
+        return median_strength(self.strengths, large)
+
+    def num_features(self, mask: Mask) -> int:
+        """Number of features in some working pixels."""
+        return int(_marked(mask, self.features / self.view.factor).sum())
+
+
+def _with_objects(middle: _Cells, others: Sequence[_Cells], clues: Sequence[_Clues]) -> _Cells:
+    """A part with the others that are objects: polarized, and as poor in features as it.
+
+    What is as rich in features as the plane belongs to the surroundings, which SfM reconstructs.
+    The ratio of the densities decides between the two. A part is judged where no larger one hides
+    it.
+    """
+
+    def counted(masks: Sequence[Mask]) -> tuple[int, int]:
+        """Number of features, and of pixels."""
+        num = sum(one.num_features(mask) for one, mask in zip(clues, masks, strict=True))
+        return num, sum(int(np.count_nonzero(mask)) for mask in masks)
+
+    covered = [one.mask(middle) for one in clues]
+    of_plane = [one.shows_plane for one in clues]
+    densities = [max(num, 1) / max(area, 1) for num, area in map(counted, (covered, of_plane))]
+    most = float(np.sqrt(np.prod(densities)))
     for part in others:
-        own = [part.mask(view) & ~other for view, other in zip(views, covered, strict=True)]
-        of_views = [
-            median_strength(image, cv2.resize(mask.astype(np.uint8), image.shape[::-1]) > 0)
-            for mask, image in zip(own, strengths, strict=True)
-            if mask.any()
-        ]
-        if of_views and np.median(of_views) > MIN_DOLP_SIGMAS:
+        own = [one.mask(part) & ~other for one, other in zip(clues, covered, strict=True)]
+        num, area = counted(own)
+        strengths = [one.strength(mask) for one, mask in zip(clues, own, strict=True) if mask.any()]
+        if area and np.median(strengths) > MIN_DOLP_SIGMAS and num < most * area:
             middle = replace(middle, held=middle.held | part.held)
             covered = [mask | other for mask, other in zip(own, covered, strict=True)]
     return middle

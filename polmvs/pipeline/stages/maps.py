@@ -242,7 +242,7 @@ def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject |
     plane = supporting_plane(points, centers)
     if plane is None:
         return None
-    found = find_object(maps, plane, points)
+    found = find_object(maps, plane, tracks)
     if found is None:
         return None
     shares = [
