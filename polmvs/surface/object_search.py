@@ -15,7 +15,7 @@ import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 
 import cv2
 import numpy as np
@@ -74,8 +74,8 @@ class SearchTolerances:
     seen_share : share of the views that must see a point; the objects lie in the common field of
         view.
     num_cells : of the coarse grid, along its side; the fine one has as many along the object's.
-    least_part : volume of another object at least, a share of that of the object in the middle. As
-        that of a piece of the hull (:class:`polmvs.surface.visual_hull.HullTolerances`).
+    least_part : volume of another object at least, a share of the largest part's. As that of a
+        piece of the hull (:class:`polmvs.surface.visual_hull.HullTolerances`).
     num_rounds : of prediction and carving; a third changes the outlines by 0.1 px.
     inner_share : of an image's longest side, distance from the outline of what is well within the
         object.
@@ -156,7 +156,7 @@ def find_object(
     near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
     # A plane without fine texture may have a coarse one.
     shown = _shown_plane(maps, plane, near, 4, None)
-    strengths = [dolp_in_sigmas(one) for one in maps]
+    strengths = [cache(partial(dolp_in_sigmas, one)) for one in maps]
     features = [tracks.obs_xy[seen] for seen in tracks.of_views(len(maps))]
     for scale in (2, 1):
         shown = _shown_plane(maps, plane, near, scale, shown)
@@ -547,7 +547,7 @@ class _Cells:
         nearness[0] = size[0] = 0
         middle = int(np.argmax(nearness))
         order = np.argsort(-size[1:], kind="stable") + 1
-        least = TOL.least_part * size[middle]
+        least = TOL.least_part * size.max()
         others = [number for number in order if number != middle and size[number] >= least]
         return [replace(self, held=parts == number) for number in (middle, *others)]
 
@@ -643,13 +643,13 @@ class _Clues:
     ----------
     view : in working pixels.
     shows_plane : (h, w) bool.
-    strengths : (H, W), as of :func:`polmvs.polarization.phase_map.dolp_in_sigmas`.
+    strengths : gives (H, W), as of :func:`polmvs.polarization.phase_map.dolp_in_sigmas`.
     features : (O, 2) image coordinates of sparse points.
     """
 
     view: _Working
     shows_plane: Mask
-    strengths: Image
+    strengths: Callable[[], Image]
     features: Floats
 
     def mask(self, part: _Cells) -> Mask:
@@ -658,8 +658,9 @@ class _Clues:
 
     def strength(self, mask: Mask) -> float:
         """Median strength of the polarization of some working pixels."""
-        large = cv2.resize(mask.astype(np.uint8), self.strengths.shape[::-1]) > 0
-        return median_strength(self.strengths, large)
+        strengths = self.strengths()
+        large = cv2.resize(mask.astype(np.uint8), strengths.shape[::-1]) > 0
+        return median_strength(strengths, large)
 
     def num_features(self, mask: Mask) -> int:
         """Number of features in some working pixels."""
@@ -686,8 +687,10 @@ def _with_objects(middle: _Cells, others: Sequence[_Cells], clues: Sequence[_Clu
     for part in others:
         own = [one.mask(part) & ~other for one, other in zip(clues, covered, strict=True)]
         num, area = counted(own)
+        if num >= most * area:
+            continue
         strengths = [one.strength(mask) for one, mask in zip(clues, own, strict=True) if mask.any()]
-        if area and np.median(strengths) > MIN_DOLP_SIGMAS and num < most * area:
+        if np.median(strengths) > MIN_DOLP_SIGMAS:
             middle = replace(middle, held=middle.held | part.held)
             covered = [mask | other for mask, other in zip(own, covered, strict=True)]
     return middle
