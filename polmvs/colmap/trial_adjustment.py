@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from polmvs.arrays import Array
 from polmvs.colmap.camera_uncertainty import CameraTolerances, parameter_covariance
 from polmvs.colmap.cameras import quiet_colmap
 from polmvs.colmap.models import read_reconstruction, registered
@@ -187,35 +188,14 @@ def _compared(given: pycolmap.Reconstruction) -> CameraTrial | None:
         or given.num_points3D() < TOL.min_points
     ):
         return None
-    fitting, errors = copy.deepcopy(given), _errors_of_images(given)
-    # First as if nothing were an outlier: a view with a wrong pose is one as a whole. Points hold
-    # the frame, for a pose that does may be the wrong one.
-    finite = [error for error in errors.values() if np.isfinite(error)]
-    widest = 2 * max(finite, default=0.0)
-    bundle, config = bundle_of(
-        fitting,
-        max(widest, ADJUSTMENT.loss_scale_px),
-        free_intrinsics=False,
-        free_principal_point=False,
-    )
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
-    bundle.ceres.solver_options.function_tolerance = TOL.max_cost_change
-    last, last_config = bundle_of(
-        fitting, ADJUSTMENT.loss_scale_px, free_intrinsics=True, free_principal_point=True
-    )
-    last.ceres.solver_options.function_tolerance = TOL.max_cost_change
-    with quiet_colmap():
-        pycolmap.create_default_bundle_adjuster(bundle, config, fitting).solve()
-        pycolmap.create_default_bundle_adjuster(last, last_config, fitting).solve()
-        fitting.update_point_3d_errors()
-        camera = next(iter(fitting.cameras.values()))
-        estimated = list(range(len(camera.params)))
-        covariance = parameter_covariance(fitting, camera, estimated, True, ADJUSTMENT)
-    if covariance is None or not np.isfinite(camera.params).all():
+    errors = _errors_of_images(given)
+    adjusted = _adjusted(given, errors)
+    if adjusted is None:
         return None
+    fitting, sigma = adjusted
+    camera = next(iter(fitting.cameras.values()))
     before = next(iter(given.cameras.values()))
     focal_at, point_at = camera.focal_length_idxs(), camera.principal_point_idxs()
-    sigma = np.sqrt(np.diag(covariance))
     change = np.asarray(camera.params) - np.asarray(before.params)
     focal_change = np.abs(change[focal_at]) / camera.mean_focal_length()
     point_change = np.abs(change[point_at]) / camera.width
@@ -241,6 +221,42 @@ def _compared(given: pycolmap.Reconstruction) -> CameraTrial | None:
         error_px=float(np.mean(list(errors.values()))),
         fitting_error_px=float(np.mean(list(fitting_errors.values()))),
     )
+
+
+def _adjusted(
+    given: pycolmap.Reconstruction, errors: dict[str, float]
+) -> tuple[pycolmap.Reconstruction, Array] | None:
+    """A model adjusted with its camera, and the deviations (P,) of the camera's parameters.
+
+    None if the camera is not determined. ``errors`` are those of the given images.
+    """
+    fitting = copy.deepcopy(given)
+    # First as if nothing were an outlier: a view with a wrong pose is one as a whole. Points hold
+    # the frame, for a pose that does may be the wrong one.
+    finite = [error for error in errors.values() if np.isfinite(error)]
+    widest = 2 * max(finite, default=0.0)
+    bundle, config = bundle_of(
+        fitting,
+        max(widest, ADJUSTMENT.loss_scale_px),
+        free_intrinsics=False,
+        free_principal_point=False,
+    )
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
+    bundle.ceres.solver_options.function_tolerance = TOL.max_cost_change
+    last, last_config = bundle_of(
+        fitting, ADJUSTMENT.loss_scale_px, free_intrinsics=True, free_principal_point=True
+    )
+    last.ceres.solver_options.function_tolerance = TOL.max_cost_change
+    with quiet_colmap():
+        pycolmap.create_default_bundle_adjuster(bundle, config, fitting).solve()
+        pycolmap.create_default_bundle_adjuster(last, last_config, fitting).solve()
+        fitting.update_point_3d_errors()
+        camera = next(iter(fitting.cameras.values()))
+        estimated = list(range(len(camera.params)))
+        covariance = parameter_covariance(fitting, camera, estimated, True, ADJUSTMENT)
+    if covariance is None or not np.isfinite(camera.params).all():
+        return None
+    return fitting, np.sqrt(np.diag(covariance))
 
 
 def _errors_of_images(reconstruction: pycolmap.Reconstruction) -> dict[str, float]:

@@ -179,34 +179,11 @@ def _fitted(
     prior = np.diag(1 / np.square(t.prior_sigma))
     change, hessian = np.zeros(NUM_PARAMETERS), prior
     for _ in range(t.num_steps):
-        x, y = ((xy - change[1:]) / (1 + change[0])).T
-        none, one = np.zeros_like(x), np.ones_like(x)
-        ray = np.column_stack([x, y, one])
-        own = np.einsum("nij,nj->ni", rotation, normals[point])
-        across = np.cross(ray, own)[:, :2]
-        length = np.maximum(np.linalg.norm(across, axis=1), 1e-9)
-        across /= length[:, None]
-        predicted = np.column_stack([-across[:, 1], across[:, 0]])
-        same = np.where(dots(measured, predicted) < 0, -1.0, 1.0)
-        residual = same * dots(measured, across)
-
-        by_w = predicted / length[:, None]  # change of the phase with w
-        turns = ((-x, -y, none), (-one, none, none), (none, -one, none))
-        camera = np.stack(
-            [
-                dots(by_w, np.cross(np.column_stack(turn), own)[:, :2]) / (1 + change[0])
-                for turn in turns
-            ]
-        )
         axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
         first = unit_or_zero(np.cross(normals, axis))
         second = np.cross(normals, first)
-        normal = np.stack(
-            [
-                dots(by_w, np.cross(ray, np.einsum("nij,nj->ni", rotation, side[point]))[:, :2])
-                for side in (first, second)
-            ]
-        )
+        turned = [np.einsum("nij,nj->ni", rotation, a[point]) for a in (normals, first, second)]
+        residual, camera, normal = _linearized(measured, xy, change, *turned)
         weight = 1 / (variance * (1 + residual**2 / variance / CAUCHY_SCALE**2))
 
         def sums(values: Array) -> Array:
@@ -227,3 +204,37 @@ def _fitted(
         moves = np.clip(moves, -0.2, 0.2)
         normals = unit_or_zero(normals + moves[:, :1] * first + moves[:, 1:] * second)
     return change, np.sqrt(np.diag(np.linalg.inv(hessian))), float(weight.sum())
+
+
+def _linearized(
+    measured: Array, xy: Array, change: Array, normals: Array, first: Array, second: Array
+) -> tuple[Array, Array, Array]:
+    """Errors of phases, and their derivatives by the camera and by moves of the normals.
+
+    Parameters
+    ----------
+    measured : (N, 2) unit, directions of the phases in the image.
+    xy : (N, 2) of the pixels, in focal lengths from the principal point.
+    change : (3,) of the camera.
+    normals, first, second : (N, 3), camera frame; the last two are the directions of the moves.
+
+    Returns
+    -------
+    Residuals (N,), and derivatives (3, N) and (2, N).
+    """
+    x, y = ((xy - change[1:]) / (1 + change[0])).T
+    none, one = np.zeros_like(x), np.ones_like(x)
+    ray = np.column_stack([x, y, one])
+    across = np.cross(ray, normals)[:, :2]
+    length = np.maximum(np.linalg.norm(across, axis=1), 1e-9)
+    across /= length[:, None]
+    predicted = np.column_stack([-across[:, 1], across[:, 0]])
+    same = np.where(dots(measured, predicted) < 0, -1.0, 1.0)
+    by_across = predicted / length[:, None]  # change of the phase with it
+    turns = ((-x, -y, none), (-one, none, none), (none, -one, none))
+    camera = [
+        dots(by_across, np.cross(np.column_stack(turn), normals)[:, :2]) / (1 + change[0])
+        for turn in turns
+    ]
+    normal = [dots(by_across, np.cross(ray, side)[:, :2]) for side in (first, second)]
+    return same * dots(measured, across), np.stack(camera), np.stack(normal)
