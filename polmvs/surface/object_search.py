@@ -165,9 +165,10 @@ def find_object(
         clues = [
             _Clues(*own) for own in zip(small, shown.shows_plane, strengths, features, strict=True)
         ]
-        coarse = _bounded(_space(small, plane), clues)
-        if coarse is None:
+        bounded = _bounded(_space(small, plane), clues)
+        if bounded is None:
             return None
+        coarse, num_cut = bounded
         masks = [coarse.mask(view) for view in small]
         # More than the object: if all of it is polarized, the object is. Half the size shows that.
         if not _views_to_search(small, masks, shown.textured):
@@ -184,6 +185,12 @@ def find_object(
     searched = _views_to_search(small, masks, shown.textured)
     if not searched:
         return None
+    if num_cut:
+        logger.warning(
+            "Polarized objects on the plane that are left out, as they reach out of the field that "
+            "most views show: %d. Move back, or give `region.mask`.",
+            num_cut,
+        )
     masks = [_decided(*given) for given in zip(masks, odds, widths, strict=True)]
     noise = _residual(small, plates, masks)
     odds = _by_texture(shown, _plane_odds(small, plates, noise), masks)
@@ -616,8 +623,10 @@ def _space(views: Sequence[_Working], plane: SupportingPlane) -> _Cells:
     return _Cells(origin, axes, np.ones(shape, bool))
 
 
-def _bounded(space: _Cells, clues: Sequence[_Clues]) -> _Cells | None:
+def _bounded(space: _Cells, clues: Sequence[_Clues]) -> tuple[_Cells, int] | None:
     """The part around the middle that remains, if it ends within the space, and other objects.
+
+    With the number of objects that do not end within the space; the cells do not have these.
 
     A view may deny a point wrongly, so others must deny it as well. Among clutter fewer views see
     the plane; if the remaining part does not end, one view is enough.
@@ -630,8 +639,10 @@ def _bounded(space: _Cells, clues: Sequence[_Clues]) -> _Cells | None:
             continue
         middle, *others = left.parts()
         if not middle.ends_at_sides:
-            standing = [part for part in others if part.stands and not part.ends_at_sides]
-            return _with_objects(middle, standing, clues)
+            objects = _objects_beside(middle, [part for part in others if part.stands], clues)
+            ending = [part.held for part in objects if not part.ends_at_sides]
+            held = np.logical_or.reduce([middle.held, *ending])
+            return replace(middle, held=held), len(objects) - len(ending)
     return None
 
 
@@ -667,8 +678,10 @@ class _Clues:
         return int(_marked(mask, self.features / self.view.factor).sum())
 
 
-def _with_objects(middle: _Cells, others: Sequence[_Cells], clues: Sequence[_Clues]) -> _Cells:
-    """A part with the others that are objects: polarized, and as poor in features as it.
+def _objects_beside(
+    middle: _Cells, others: Sequence[_Cells], clues: Sequence[_Clues]
+) -> list[_Cells]:
+    """Which other parts are objects as well: polarized, and as poor in features as the middle.
 
     What is as rich in features as the plane belongs to the surroundings, which SfM reconstructs.
     The ratio of the densities decides between the two. A part is judged where no larger one hides
@@ -683,7 +696,7 @@ def _with_objects(middle: _Cells, others: Sequence[_Cells], clues: Sequence[_Clu
     covered = [one.mask(middle) for one in clues]
     of_plane = [one.shows_plane for one in clues]
     densities = [max(num, 1) / max(area, 1) for num, area in map(counted, (covered, of_plane))]
-    most = float(np.sqrt(np.prod(densities)))
+    most, found = float(np.sqrt(np.prod(densities))), []
     for part in others:
         own = [one.mask(part) & ~other for one, other in zip(clues, covered, strict=True)]
         num, area = counted(own)
@@ -691,9 +704,9 @@ def _with_objects(middle: _Cells, others: Sequence[_Cells], clues: Sequence[_Clu
             continue
         strengths = [one.strength(mask) for one, mask in zip(clues, own, strict=True) if mask.any()]
         if np.median(strengths) > MIN_DOLP_SIGMAS:
-            middle = replace(middle, held=middle.held | part.held)
+            found.append(part)
             covered = [mask | other for mask, other in zip(own, covered, strict=True)]
-    return middle
+    return found
 
 
 def _with_extent(

@@ -265,10 +265,12 @@ def test_a_thin_arm_is_not_lost(radius, doublings):
     assert np.median(shares) > 0.9  # measured: 0.98, 0.97
 
 
-def polarized_beside(*places: tuple[float, float]) -> list[PhaseMap]:
-    """The ball with small balls beside it; it and those at ``places`` are polarized."""
+def polarized_beside(
+    *places: tuple[float, float], beside: tuple[tuple[float, float], ...] = (BESIDE, OPPOSITE)
+) -> list[PhaseMap]:
+    """The ball with small balls ``beside`` it; it and those at ``places`` are polarized."""
     rng, maps = np.random.default_rng(3), []
-    for one in capture(printed(), ball=0.05, beside=(BESIDE, OPPOSITE)):
+    for one in capture(printed(), ball=0.05, beside=beside):
         xy = pixel_centers(one.view.camera.width, one.view.camera.height)
         own = on_ball(one.view, xy)
         for place in places:
@@ -297,6 +299,22 @@ def test_what_is_polarized_beside_the_ball_is_an_object_too():
     own, other = shares_found(maps, found)
     assert own > 0.9  # measured: 0.994
     assert other < 0.1  # 0 where the balls do not hide it
+
+
+@pytest.mark.parametrize("is_polarized", [True, False])
+def test_an_object_at_the_side_is_left_out_with_a_warning(caplog, is_polarized):
+    side = (1.45, 1.1)
+    maps = polarized_beside(*[side] * is_polarized, beside=(side,))
+    found = find_object(maps, TABLE, table_tracks(maps, (side,)))
+    assert found is not None
+    shares = []
+    for one, hiding in zip(maps, found, strict=True):
+        xy = pixel_centers(one.view.camera.width, one.view.camera.height)
+        ball = on_small(one.view, xy, side) & ~on_ball(one.view, xy)
+        if ball.any():
+            shares.append(hiding.mask[ball].mean())
+    assert np.median(shares) < 0.1
+    assert ("most views show: 1." in caplog.text) == is_polarized
 
 
 def test_what_is_rich_in_features_belongs_to_the_surroundings():
