@@ -27,6 +27,7 @@ ARM = 0.06  # radius of the arm, along x from the ball's centre to its end
 ARM_END = 1.7
 SMALL = 0.3  # radius of two balls, and where they stand
 BESIDE, OPPOSITE = (0.5, 1.4), (-1.1, -1.0)
+NUM_POINTS = 6000  # sparse points of the table
 
 
 def printed(seed: int = 0) -> np.ndarray:
@@ -135,8 +136,15 @@ def capture(
     doublings: int = 1,
     elevations: tuple[float, ...] = (30.0, 55.0),
 ) -> list[PhaseMap]:
-    looks = {"ball": ball, "cap": cap, "lamp": lamp, "end": end, "arm": arm, "shadow": shadow}
-    looks["beside"] = beside
+    looks = {
+        "ball": ball,
+        "cap": cap,
+        "lamp": lamp,
+        "end": end,
+        "arm": arm,
+        "shadow": shadow,
+        "beside": beside,
+    }
     views = ring_of_views(10, elevations=elevations)
     for _ in range(doublings):
         views = [finer(view) for view in views]
@@ -166,8 +174,10 @@ def table_tracks(
 ) -> Tracks:
     """Sparse points of the table, and of one of the small balls, where views see them."""
     rng = np.random.default_rng(2)
-    points = np.concatenate([rng.uniform(-4, 4, (6000, 2)), rng.normal(0, 1e-3, (6000, 1))], axis=1)
-    normals = np.tile((0.0, 0.0, 1.0), (6000, 1))
+    points = np.concatenate(
+        [rng.uniform(-4, 4, (NUM_POINTS, 2)), rng.normal(0, 1e-3, (NUM_POINTS, 1))], axis=1
+    )
+    normals = np.tile((0.0, 0.0, 1.0), (NUM_POINTS, 1))
     if printed_at is not None:
         outwards = unit(rng.normal(size=(150, 3)))
         points = np.concatenate([points, (*printed_at, SMALL) + SMALL * outwards])
@@ -179,7 +189,7 @@ def table_tracks(
         shown &= (normals * (view.center_in_world - points)).sum(axis=1) > 0
         shown &= ~on_ball(view, xy)
         for place in beside:
-            shown[:6000] &= ~on_small(view, xy[:6000], place)
+            shown[:NUM_POINTS] &= ~on_small(view, xy[:NUM_POINTS], place)
         track = np.flatnonzero(shown)
         seen.append((track, np.full(len(track), index), xy[track]))
     tracks, views, xy = (np.concatenate(parts) for parts in zip(*seen, strict=True))
