@@ -330,10 +330,11 @@ def find_vessel(scene: RayScene, top: SupportingPlane, gsd: float, gain: Gain) -
     members = np.flatnonzero(np.abs(height) < 2 * SAME_PLANE_PX * gsd)
     rim = Patch(top.normal, top.offset - TOL.rounding * gsd, members)
     opening = Opening(patch, rim.members, float(mesh.face_areas[patch].sum()))
-    if len(rim.members) < MIN_BORDER or opening.area < _least_area(gsd):
+    below = height <= 0
+    if not below.any() or len(rim.members) < MIN_BORDER or opening.area < _least_area(gsd):
         return None
     surface = SurfaceFaces(
-        mesh.centers, mesh.face_normals, height <= 0, [opening], scene.inside_along, gsd
+        mesh.centers, mesh.face_normals, below, [opening], scene.inside_along, gsd
     )
     within = _cavities_within(surface, opening, rim)
 

@@ -37,6 +37,7 @@ from polmvs.polarization.phase_map import (
 from polmvs.scene import Tracks, View
 from polmvs.surface.matting import find_outline
 from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
+from polmvs.surface.vignetting import NUM_TERMS, fit_vignetting, vignetting_terms
 from polmvs.surface.visual_hull import SupportingPlane
 
 logger = logging.getLogger(__name__)
@@ -62,6 +63,8 @@ class SearchTolerances:
     window_px : of the correlation with other views, working pixels.
     num_near : number of other views with which a view is correlated.
     num_others : largest number of other views that predict the plane.
+    num_samples : pixels of each view at most from which vignetting is fitted. Measured on two
+        captures: of 2,000, which darken by 0.06 and 0.22, it differs by less than 0.002.
     detail_px : deviation of the average that is subtracted to get texture.
     lighting_share : of an image's longest side, window over which the plane's brightness may differ
         between views, and in which the background's appearance is compared with the object's.
@@ -90,6 +93,7 @@ class SearchTolerances:
     window_px: int = 5
     num_near: int = 6
     num_others: int = 12
+    num_samples: int = 300
     detail_px: float = 2.0
     lighting_share: float = 1 / 8
     num_levels: int = 32
@@ -160,7 +164,9 @@ def find_object(
     features = [tracks.obs_xy[seen] for seen in tracks.of_views(len(maps))]
     for scale in (2, 1):
         shown = _shown_plane(maps, plane, near, scale, shown)
-        small = _with_extent(shown.views, shown.textured, plane)
+        small = _with_extent(
+            _without_vignetting(shown.views, shown.textured), shown.textured, plane
+        )
         shown = replace(shown, views=small)
         clues = [
             _Clues(*own) for own in zip(small, shown.shows_plane, strengths, features, strict=True)
@@ -254,7 +260,7 @@ def _shown_plane(
     return _Shown(views, textured, hidden, shows_plane)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Working:
     """A view in working pixels.
 
@@ -265,7 +271,8 @@ class _Working:
     intensity : (H, W) float32, in its own pixels.
     measured : (H, W, 4) float32, ``s1 / s0`` and ``s2 / s0`` as of the phase map, with variances.
     lowest : intensity whose logarithm is the lowest.
-    log : (h, w) float32, logarithm of the intensity.
+    vignetting : (h, w) float32, logarithm of the intensity that the lens loses, if it is known.
+    log : (h, w) float32, logarithm of the intensity, without vignetting.
     region : (h, w) bool, its polarized region.
     polarized : (h, w) bool, the region without what may be background up to the image's border.
     on_plane : (h, w, 3), where each pixel's ray meets the plane; NaN where it does not.
@@ -277,6 +284,7 @@ class _Working:
     intensity: Image
     measured: Image
     lowest: float
+    vignetting: Image
     log: Image
     region: Mask
     polarized: Mask
@@ -286,6 +294,12 @@ class _Working:
     @property
     def center(self) -> Array:
         return self.view.center_in_world
+
+    @property
+    def without_vignetting(self) -> Image:
+        """(H, W) intensity, in its own pixels."""
+        lost = cv2.resize(self.vignetting, self.intensity.shape[::-1])
+        return np.asarray(self.intensity * np.exp(lost), np.float32)
 
     @cached_property
     def polarization(self) -> Image:
@@ -327,7 +341,17 @@ def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> 
     has_plane = np.asarray(np.isfinite(on_plane).all(axis=-1), np.bool_)
     measured = np.asarray(phase_map.polarization)
     return _Working(
-        view, factor, image, measured, lowest, log, region, polarized, on_plane, has_plane
+        view=view,
+        factor=factor,
+        intensity=image,
+        measured=measured,
+        lowest=lowest,
+        vignetting=np.zeros_like(log),
+        log=log,
+        region=region,
+        polarized=polarized,
+        on_plane=on_plane,
+        has_plane=has_plane,
     )
 
 
@@ -707,6 +731,43 @@ def _objects_beside(
             found.append(part)
             covered = [mask | other for mask, other in zip(own, covered, strict=True)]
     return found
+
+
+def _without_vignetting(
+    views: Sequence[_Working], shows_plane: Sequence[Mask]
+) -> list[_Working]:
+    """Views with the intensity that a lens without vignetting would give.
+
+    What remains of the plane's change of brightness between views is due to the light.
+    """
+    rng = np.random.default_rng(0)
+    terms = [
+        vignetting_terms(view.view.camera, pixel_centers(*view.log.shape[::-1]) * view.factor)
+        for view in views
+    ]
+    ratios, of_terms, of_distances = [], [], []
+    for index, view in enumerate(views):
+        pixels = rng.permutation(np.flatnonzero(shows_plane[index]))[: TOL.num_samples]
+        points = view.on_plane.reshape(-1, 3)[pixels]
+        own_terms = terms[index].reshape(-1, NUM_TERMS)[pixels]
+        for number in _others(views, index):
+            other = views[number]
+            xy = other.project(points)
+            ratio = view.log.ravel()[pixels] - sample_image(other.log, xy)
+            other_terms = vignetting_terms(other.view.camera, xy * other.factor)
+            both = other.sees(xy) & _marked(shows_plane[number], xy)
+            ratios.append(np.diff(ratio[both]))
+            of_terms.append(np.diff((own_terms - other_terms)[both], axis=0))
+            distance = lengths(points - view.center) / lengths(points - other.center)
+            of_distances.append(np.diff(np.log(distance[both])))
+    coefficients = fit_vignetting(
+        *(np.concatenate(values) for values in (ratios, of_terms, of_distances))
+    )
+    lost = [np.asarray(own @ coefficients, np.float32) for own in terms]
+    return [
+        replace(view, vignetting=own, log=view.log + own)
+        for view, own in zip(views, lost, strict=True)
+    ]
 
 
 def _with_extent(
@@ -1111,9 +1172,10 @@ def _found(
     behind = partial(_behind, views, index, plate, plane)
     # Clipped light has no known polarization; 0 on both sides of an outline tells nothing.
     known = np.isfinite(view.measured[..., 2:3])
-    polarized = np.where(known, view.measured[..., :2] * view.intensity[..., None], 0)
+    intensity = view.without_vignetting
+    polarized = np.where(known, view.measured[..., :2] * intensity[..., None], 0)
     distance = find_outline(
-        view.intensity,
+        intensity,
         coarse,
         behind,
         noise,
@@ -1146,6 +1208,7 @@ def _behind(
         image = sample_image(views[other].intensity, there * views[other].factor)
         small = xy * (np.array(change.shape[::-1]) / np.array(view.log.shape[::-1]))
         log = np.log(np.maximum(image, views[other].lowest)) + sample_image(change, small)
+        log += sample_image(views[other].vignetting, there)
         shown.append(np.where(seen & has_plane, log, np.nan))
     stack = np.array(shown, np.float32).reshape(-1, *places.shape[:-1])
     log, deviation = _median_and_deviation(stack)

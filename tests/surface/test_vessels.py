@@ -107,3 +107,15 @@ def test_a_vessel_is_carved_into_a_rough_hull_only_if_views_agree(of_bowl, gains
 def test_without_a_plane_no_vessel_is_looked_for(of_bowl):
     hull, fit = of_bowl
     assert opened_hull(hull, None, fit) == (hull, None)
+
+
+def test_a_plane_below_the_whole_hull_is_the_rim_of_no_vessel(of_bowl):
+    hull, _ = of_bowl
+    lowest = hull.mesh.centers[:, 2].min()
+
+    def gain(cavity):
+        return np.ones(8)
+
+    for below in (0.25, 1.0):  # its bottom is near the plane; the plane is far below
+        top = replace(GROUND, offset=float(lowest - below * hull.gsd))
+        assert find_vessel(RayScene(hull.mesh), top, hull.gsd, gain) is None
