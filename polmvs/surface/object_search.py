@@ -733,9 +733,7 @@ def _objects_beside(
     return found
 
 
-def _without_vignetting(
-    views: Sequence[_Working], shows_plane: Sequence[Mask]
-) -> list[_Working]:
+def _without_vignetting(views: Sequence[_Working], shows_plane: Sequence[Mask]) -> list[_Working]:
     """Views with the intensity that a lens without vignetting would give.
 
     What remains of the plane's change of brightness between views is due to the light.

@@ -1,12 +1,13 @@
 """Vignetting of a camera, from a plane that several views show.
 
-A lens darkens its image with the angle theta from its axis, alike in all views. A lamp at the camera
-darkens the plane with the distance d instead:
+A lens darkens its image with the angle theta from its axis, alike in all views. The light of a lamp
+at the camera falls off with the distance d instead:
 
     log I = log L + log g - V(theta) - c log d,     V(theta) = a sin^2 theta + b sin^4 theta
 
-The radiance L of a point cancels between two views, their gains g cancel between two points. With
-the lamp alone c is 3, by the square of the distance and the cosine at the plane; without one it is 0.
+The radiance L of a point cancels between two views, their gains g cancel between two points. c is 0
+without such a lamp, and 3 with no other light: the square of the distance, and the cosine at the
+plane.
 """
 
 from __future__ import annotations
@@ -25,9 +26,13 @@ NUM_TERMS = 2
 
 
 def vignetting_terms(camera: Camera, xy: Floats) -> Array:
-    """Powers ``(..., 2)`` of the sine of the angle from the axis, of image coordinates ``(..., 2)``.
+    """Even powers ``(..., 2)`` of the sine of the angle from the axis.
 
     Their product with the coefficients is V.
+
+    Parameters
+    ----------
+    xy : image coordinates ``(..., 2)``.
     """
     square = 1.0 - camera.rays(xy)[..., 2] ** 2
     return np.stack([square, square**2], axis=-1)
