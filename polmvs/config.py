@@ -39,7 +39,6 @@ class Method(StrEnum):
     """Method that makes the surface from the phases."""
 
     SURFACE = "surface"
-    INTEGRATE = "integrate"
     CONTOUR = "contour"
 
 
@@ -536,8 +535,7 @@ class PropagationOptions(OptionGroup, group="propagation"):
     method: Method = option(
         Method.SURFACE,
         "'surface': one mesh that all views agree on, from their silhouettes and phases; "
-        "'integrate': multi-view normals over the region's pixels, coarse to fine; 'contour': "
-        "along phase contours, as in the paper",
+        "'contour': view by view along phase contours, as in the paper",
     )
     contour: Contour = option(
         Contour.TANGENT,
@@ -551,12 +549,7 @@ class PropagationOptions(OptionGroup, group="propagation"):
     stride_px: int = option(
         2, "distance between the dense points of one view, px", least=1, most=16
     )
-    num_rounds: int = option(
-        6,
-        "rounds of normals and ranges; of integrate on its coarsest lattice, two finer follow",
-        least=1,
-        most=20,
-    )
+    num_rounds: int = option(6, "rounds of normals and ranges", least=1, most=20)
     bending: float = option(
         0.002,
         "standard deviation, as a share of the distance, of the smooth bending of a surface by "

@@ -2,7 +2,7 @@
 
 CAPTURE has ``gt/`` and mosaics of 8 bits, whose steps are filled with noise that finer formats
 show. Each format is written to a folder of WORK, with the truth turned where the format turns the
-images, and run as ``polmvs compare CAPTURE OUT --gt GT --method integrate`` with the poses of the
+images, and run as ``polmvs compare CAPTURE OUT --gt GT --method contour`` with the poses of the
 first (``--sparse``): a grain of noise moves those of SfM by more than a format does. Formats that
 give the same Stokes images to the last bit share a run. Figures stay in WORK, so that a later call
 goes on where one ended. Prints a table, and which figures of a format differ by more than 5 % from
@@ -175,7 +175,7 @@ def run(capture: Path, truth: Path, written: Written, work: Path) -> dict:
         options = Options(
             capture=written.options,
             sfm=sfm,
-            propagation=PropagationOptions(method=Method.INTEGRATE),
+            propagation=PropagationOptions(method=Method.CONTOUR),
             evaluation=EvaluationOptions(gt=work / "gt"),
         )
         alone = RunOptions(workers=1, overwrite=True)

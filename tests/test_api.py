@@ -395,7 +395,7 @@ def test_frames_in_memory_become_a_run(demo_capture, tmp_path):
     stems = ("000", "002", "004", "006", "008")
     frames = {f"left {stem}": mosaic_of(demo_capture, stem) for stem in stems}
     result = polmvs.reconstruct(
-        frames, tmp_path / "out", intrinsics=INTRINSICS, method="integrate", stride_px=8,
+        frames, tmp_path / "out", intrinsics=INTRINSICS, method="contour", stride_px=8,
         mesh=False, colmap=False,
     )  # fmt: skip
     assert sorted(p.name for p in (tmp_path / "out_frames").iterdir()) == [

@@ -69,7 +69,7 @@ def test_text_names_choices_and_paths() -> None:
         (lambda: PropagationOptions(stride_px=None), "`propagation.stride_px` cannot be none."),
         (
             lambda: PropagationOptions(method=3),
-            "`propagation.method` must be one of surface, integrate, contour, not 3.",
+            "`propagation.method` must be one of surface, contour, not 3.",
         ),
         (lambda: SfmOptions(seed=1.5), "`sfm.seed` cannot be 1.5: Expected int, got float."),
         (

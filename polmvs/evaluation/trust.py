@@ -54,8 +54,8 @@ class NormalRanges:
         0.9, OPA's 6.
     excess_deg : measured, 0 to 0.5; with the light of a glazed figure 2 to 2.7; OPA's 7. The end is
         a guess.
-    agreement : measured, 0.95 to 1; 0.70 with `integrate` on ``step``, which bridges its parallel
-        patches (24 % within a millimetre).
+    agreement : measured, 0.95 to 1; 0.65 with `contour` on ``step``, which bridges its parallel
+        patches (31 % within a millimetre).
     inside : measured, 0.95 to 1; marks in a region and its uncertain border cost the rest.
     determined : measured, 0.79 to 1 if every part has marks; parts without any lower it correctly,
         so the end is a guess.
@@ -166,7 +166,7 @@ class Trust:
     num_views : number of views of the capture.
     left_out : views without a pose, and inconsistent views.
     predicted : held-out views, predicted from a surface of the others; None if not made.
-    fitted : all views, predicted from the surface; None if the views were integrated one by one.
+    fitted : all views, predicted from the surface; None without a surface of all views.
     soundness : of the mesh; likewise.
     contradicted_share : share of the surface that its phases contradict; likewise.
     complaints : errors that earlier stages found (cameras, pattern, light), one clause each.

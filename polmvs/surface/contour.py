@@ -1,22 +1,15 @@
-"""Contours of phase, which carry ranges over a polarized region, as in the paper.
+"""Contours of phase, along which a surface keeps its range, as in the paper.
 
 A row ``m`` is a tangent of the surface. Under PPA it is perpendicular to the ray, so a point moved
 along it keeps its distance to the camera centre: the contour is an iso-range curve. Under OPA it
 has no z component and the contour is an iso-depth curve (Cui et al. 2017). Both need one view
 and no normal. The curves are traced in the image; the constant quantity is applied afterwards, so
-it does not drift.
-
-Contours traced through a view's phase carry a seed's range across the region; normals solved from
-the phases of all views carry it sideways, from contour to contour. One robust least-squares
-problem per view combines both, so every node uses all seeds.
+it does not drift (:mod:`polmvs.surface.propagation`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,40 +17,20 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
-from polmvs.config import Contour, PropagationOptions
-from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.angle_models import rows_from_axial
 from polmvs.polarization.kinds import AngleModel
-from polmvs.polarization.phase_map import PhaseMap, view_rays
-from polmvs.scene import Seeds
-from polmvs.surface.dense_view import DenseView, store_dense_view
-from polmvs.surface.integration import (
-    RoundPlan,
-    ViewTask,
-    in_rounds,
-    relax,
-    spread_nodes,
-    surface_at_seeds,
-)
-from polmvs.surface.pixel_graph import Nodes, uncrossed, visible_seeds
-from polmvs.surface.view_selection import choose_neighbors
 
 Floats = NDArray[np.floating]
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
-
-
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContourTolerances:
-    """Tolerances of the tracing of contours, and of their connections.
+    """Tolerances of the tracing of contours.
 
     Attributes
     ----------
-    num_neighbors : number of neighbours to which a node is connected. Guess.
     min_dolp : smoothed; contours stop below it. Guess; without it F at 1 mm of OPA on the bundled
         capture is 33.0 and not 35.4 %.
     min_coherence : of neighbouring directions: a contour stops in an incoherent field.
@@ -65,133 +38,12 @@ class ContourTolerances:
     meeting_px : distance at which the two halves of a closed curve end. Guess.
     """
 
-    num_neighbors: int = 6
     min_dolp: float = 0.05
     min_coherence: float = 0.7
     meeting_px: float = 2.0
 
 
 TOL = ContourTolerances()
-
-
-def propagate(
-    angle_model: AngleModel,
-    maps: Sequence[PhaseMap],
-    seeds: Seeds,
-    options: PropagationOptions,
-    folder: Path,
-    *,
-    tilt_aware: bool = True,
-    workers: Workers | None = None,
-    on_progress: OnProgress = no_progress,
-) -> list[DenseView | None]:
-    """Range and normal over the polarized region of every view.
-
-    Parameters
-    ----------
-    angle_model : OPA or PPA; it sets the rows of the normals and the constant of a contour.
-    maps : phase maps of the posed views.
-    seeds : points on the surface.
-    folder : for the dense views, which stay on disk; existing files are replaced.
-    tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
-    workers : processes for the views; None: this process.
-    on_progress : called with the number of views done, ``(num_rounds + 1)`` times per view.
-
-    Returns
-    -------
-    Dense result of each view, or None if no seed reaches its region.
-    """
-    workers = workers or Workers(1)
-    nodes: list[Nodes | None] = []
-    start = partial(_start, angle_model, seeds, options)
-    for started in workers.map(start, maps):
-        nodes.append(started)
-        on_progress(1)
-    strides = [2 * options.stride_px] * (options.num_rounds - 1) + [options.stride_px]
-    plans = [RoundPlan(stride_px, use_consensus=False) for stride_px in strides]
-    neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
-    solve = partial(_round, angle_model, seeds, options, tilt_aware)
-    return in_rounds(solve, plans, maps, neighbors, folder, workers, on_progress, nodes)
-
-
-def _connect(
-    contours: Contours, phase_map: PhaseMap, spacing_px: float
-) -> tuple[Indices, Indices, NDArray[np.bool_]]:
-    """Edges between consecutive nodes of a curve and between neighbouring nodes of all curves."""
-    xy = contours.xy
-    num = len(xy)
-    follows = contours.curve[1:] == contours.curve[:-1]
-    along = np.stack([np.flatnonzero(follows), np.flatnonzero(follows) + 1], axis=1)
-    k = min(TOL.num_neighbors + 1, num)
-    distance, index = cKDTree(xy).query(xy, k=k, distance_upper_bound=2.2 * spacing_px)
-    tails = np.repeat(np.arange(num), k)
-    heads, near = index.reshape(-1), distance.reshape(-1)
-    cross = (heads < num) & (heads != tails) & (near > 0)
-    pairs = np.unique(np.sort(np.stack([tails[cross], heads[cross]], axis=1), axis=1), axis=0)
-    is_along = np.isin(pairs[:, 0] * num + pairs[:, 1], along[:, 0] * num + along[:, 1])
-    pairs = np.concatenate([along, pairs[~is_along]])
-    on_contour = np.arange(len(pairs)) < len(along)
-    clear = uncrossed(phase_map, xy[pairs[:, 0]], xy[pairs[:, 1]])
-    return pairs[clear, 0], pairs[clear, 1], on_contour[clear]
-
-
-def _start(
-    angle_model: AngleModel,
-    seeds: Seeds,
-    options: PropagationOptions,
-    phase_map: PhaseMap,
-) -> Nodes | None:
-    """Network of a view's contours with ranges and normals from the nearest seeds."""
-    path_model = AngleModel.OPA if options.contour is Contour.NORMALS else angle_model
-    open_pixels = phase_map.region.inside & ~phase_map.region.edges
-    dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
-    passable = open_pixels & (dolp > TOL.min_dolp)
-    rays = view_rays(phase_map.view)
-    visible, seeds_xy = visible_seeds(phase_map, seeds)
-    contours = cover_with_contours(
-        direction_field(path_model, phase_map.samples, rays, passable),
-        seeds_xy[visible],
-        open_pixels,
-        spacing_px=options.spacing_px,
-        step_px=options.step_px,
-    )
-    surface = surface_at_seeds(phase_map, seeds, contours.xy)
-    if surface is None:
-        return None
-    tail, head, on_contour = _connect(contours, phase_map, options.spacing_px)
-    return Nodes(
-        surface=surface,
-        ray_z=phase_map.view.camera.rays(contours.xy)[:, 2],
-        spacing_px=options.spacing_px,
-        focal_px=phase_map.view.camera.mean_focal_px,
-        tail=tail,
-        head=head,
-        on_contour=on_contour,
-    )
-
-
-def _round(
-    angle_model: AngleModel,
-    seeds: Seeds,
-    options: PropagationOptions,
-    tilt_aware: bool,
-    task: ViewTask,
-) -> tuple[Nodes | None, DenseView | None]:
-    """Normals and ranges of one view's nodes, and the dense view that they make."""
-    if task.nodes is None:
-        return None, None
-    nodes = relax(
-        angle_model,
-        task.maps,
-        task.dense,
-        task.nodes,
-        seeds,
-        bending=options.bending,
-        tilt_aware=tilt_aware,
-        along_contours=options.contour is Contour.TANGENT,
-    )
-    dense = spread_nodes(task.maps[0], nodes, task.plan.stride_px)
-    return nodes, store_dense_view(dense, task.path) if dense is not None else None
 
 
 @dataclass(frozen=True)

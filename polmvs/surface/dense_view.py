@@ -118,21 +118,6 @@ class SurfaceSamples:
         return SurfaceSamples(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
-def view_samples(dense: DenseView, rays_in_world: Floats) -> SurfaceSamples:
-    """The known points of a dense view; ``rays_in_world`` (h, w, 3) are its lattice's."""
-    known = dense.known
-    distance = dense.range_map[known].astype(np.float64)
-    return SurfaceSamples(
-        xy=dense.lattice_xy()[known],
-        rays_in_world=rays_in_world[known],
-        log_range=np.log(distance),
-        normals=dense.normals_in_world[known].astype(np.float64),
-        normal_sigma=np.radians(dense.sigma_deg[known].astype(np.float64)),
-        log_range_sigma=dense.sigma[known] / distance,
-        confidence=dense.confidence[known].astype(np.float64),
-    )
-
-
 def extend_planes(
     samples: SurfaceSamples, xy: Floats, rays_in_world: Floats, max_gap_px: float
 ) -> SurfaceSamples:

@@ -38,17 +38,12 @@ class Edges:
 
 @dataclass(frozen=True, kw_only=True)
 class SeedTies:
-    """Seeds tied to nodes: ``log_range[node] = value`` with deviation ``sigma``; by seed index.
-
-    ``common`` is the deviation of an error that all ties share. It does not change their weight,
-    only the uncertainty of the solution.
-    """
+    """Seeds tied to nodes: ``log_range[node] = value`` with deviation ``sigma``; by seed index."""
 
     node: Indices
     seed: Indices
     value: Array
     sigma: Array
-    common: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,8 +133,7 @@ def solve_log_ranges(
         robust[:num_edges] = cauchy_weights(z2[:num_edges], scale)
         robust[num_edges : len(z2) - num_modes] = seed_weight[ties.seed]
     log_range[reached] = system.log_ranges(solution)[:, 0]
-    common = np.concatenate([np.zeros(num_edges), ties.common, np.zeros(num_modes)])
-    draws = factors.solve(_noise(sigma, used, common))
+    draws = factors.solve(_noise(sigma, used))
     spread[reached] = system.log_ranges(draws).std(axis=1)
     edge_weight[keep] = robust[:num_edges]
     return RangeSolution(
@@ -147,18 +141,15 @@ def solve_log_ranges(
     )
 
 
-def _noise(sigma: Array, robust: Array, common: Array) -> Array:
+def _noise(sigma: Array, robust: Array) -> Array:
     """Draws (M, NUM_DRAWS) of the observations' noise, wider where the loss trusts them less.
-
-    Observations with a ``common`` deviation err as one by that much.
 
     The solutions for them scatter as the solution for the observations does: its deviation at
     every node without the inverse of the normal matrix.
     """
     rng = np.random.default_rng(0)
-    own = np.where(common > 0, 0, sigma / np.sqrt(np.maximum(robust, 1e-6)))
-    draws = rng.standard_normal((len(sigma), NUM_DRAWS)) * own[:, None]
-    return draws + common[:, None] * rng.standard_normal(NUM_DRAWS)
+    own = sigma / np.sqrt(np.maximum(robust, 1e-6))
+    return rng.standard_normal((len(sigma), NUM_DRAWS)) * own[:, None]
 
 
 class _System:

@@ -54,7 +54,7 @@ TOL = GraphTolerances()
 
 @dataclass(frozen=True)
 class Nodes:
-    """Nodes of one view, on contours or on a lattice, and what is known about them.
+    """Nodes of one view on contours, and what is known about them.
 
     Attributes
     ----------
@@ -86,20 +86,6 @@ def visible_seeds(phase_map: PhaseMap, seeds: Seeds) -> tuple[NDArray[np.bool_],
     xy = view.project(points)
     facing = view.faces(points, normals) | ~np.isfinite(normals).all(axis=-1)
     return phase_map.shows_surface(xy) & facing, np.asarray(xy, np.float64)
-
-
-def lattice_edges(wanted: NDArray[np.bool_]) -> tuple[Indices, Indices]:
-    """Pairs of neighbours in rows and columns of the ``wanted`` (h, w) points of a lattice.
-
-    Returns
-    -------
-    tail, head : (E,) indices in the list of the wanted points, row by row.
-    """
-    index = np.where(wanted, np.cumsum(wanted).reshape(wanted.shape) - 1, -1)
-    pairs = [(index[:, :-1], index[:, 1:]), (index[:-1], index[1:])]
-    tail = np.concatenate([a[(a >= 0) & (b >= 0)] for a, b in pairs])
-    head = np.concatenate([b[(a >= 0) & (b >= 0)] for a, b in pairs])
-    return tail, head
 
 
 def uncrossed(phase_map: PhaseMap, start_xy: Floats, end_xy: Floats) -> NDArray[np.bool_]:
@@ -239,4 +225,4 @@ def tie_seeds(
     gsd = 1 / phase_map.view.camera.mean_focal_px
     sigma = np.sqrt(k * (seeds.sigma[seed] / distance[seed]) ** 2 + (0.02 * (1 + gap) * gsd) ** 2)
     value = np.log(distance[seed]) + step
-    return SeedTies(node=node, seed=seed, value=value, sigma=sigma, common=np.zeros(len(node)))
+    return SeedTies(node=node, seed=seed, value=value, sigma=sigma)

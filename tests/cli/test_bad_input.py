@@ -29,7 +29,7 @@ from polmvs.scene import PointKind, Tracks
 INTRINSICS = "333.75,333.75,230.6475,196.608"  # of the bundled capture
 SIZE = (48, 64)
 # For what is not about the surface: one that is a quarter of the work.
-QUICK = ("--method", "integrate", "--stride-px", 8)
+QUICK = ("--method", "contour", "--stride-px", 8)
 CLOUD_ONLY = ("--no-mesh", "--no-colmap", "--no-report")
 
 

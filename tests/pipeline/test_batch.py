@@ -27,7 +27,7 @@ from polmvs.errors import DataError, OptionError
 from polmvs.pipeline.batch import BatchEntry, read_batch, row_of, run_batch
 from polmvs.polarization.kinds import AngleModel, Light
 
-COARSE = ("--method", "integrate", "--stride-px", 8, "--no-mesh", "--no-colmap", "--workers", 2)
+COARSE = ("--method", "contour", "--stride-px", 8, "--no-mesh", "--no-colmap", "--workers", 2)
 
 
 @pytest.fixture(scope="module")

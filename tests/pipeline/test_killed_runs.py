@@ -271,7 +271,7 @@ def test_stages_stop_their_workers_before_their_files_go(
         capture=given[0],
         out=out,
         options=Options(
-            sfm=SfmOptions(sparse=given[2]), propagation=PropagationOptions(method=Method.INTEGRATE)
+            sfm=SfmOptions(sparse=given[2]), propagation=PropagationOptions(method=Method.CONTOUR)
         ),
         run_options=RunOptions(workers=1),
     )

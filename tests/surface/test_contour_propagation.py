@@ -13,9 +13,9 @@ from polmvs.config import (
 from polmvs.parallel import Workers
 from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
-from polmvs.surface.contour import propagate
 from polmvs.surface.dense_view import DenseView, open_dense_view, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse, merge
+from polmvs.surface.propagation import propagate
 
 OPTIONS = PropagationOptions(num_rounds=2, stride_px=2)
 

@@ -12,14 +12,13 @@ def chain(num, delta=0.01, sigma=0.001):
     return Edges(tail=tail, head=tail + 1, delta=delta * ones, sigma=sigma * ones)
 
 
-def ties(nodes, values, sigma=0.001, common=None):
+def ties(nodes, values, sigma=0.001):
     nodes = np.asarray(nodes, np.int64)
     return SeedTies(
         node=nodes,
         seed=np.arange(len(nodes)),
         value=np.asarray(values, float),
         sigma=np.full(len(nodes), sigma),
-        common=np.zeros(len(nodes)) if common is None else common,
     )
 
 
@@ -233,16 +232,3 @@ def test_the_normal_of_an_increment_may_be_of_any_length():
     for length in (7.0, 0.01):
         scaled = log_range_increment(length * normal, rays[0], rays[1])
         assert scaled == pytest.approx(step, abs=1e-12)
-
-
-def test_ties_that_err_as_one_do_not_make_each_other_certain():
-    num = 400
-    edges = chain(num, delta=0.0)
-    alone = solve_log_ranges(num, edges, ties(np.arange(num), np.zeros(num), 0.01), num)
-    common = np.full(num, 0.01)
-    as_one = ties(np.arange(num), np.zeros(num), 0.01, common)
-    together = solve_log_ranges(num, edges, as_one, num)
-    np.testing.assert_allclose(together.log_range, alone.log_range, atol=1e-12)
-    assert alone.sigma.mean() < 0.004
-    # 18 % uncertain; one draw for all nodes.
-    assert 0.006 < together.sigma.mean() < 0.014

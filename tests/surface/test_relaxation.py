@@ -1,26 +1,19 @@
-"""One round of one view: which views tie its nodes, and how certain the result is."""
+"""One round of one view: its nodes' normals and ranges, and how certain they are."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scenes import CAMERA, board_scene, phase_map_of
-from true_views import BALL, BOARD, scene_of, true_samples, true_view
+from true_views import BALL, BOARD, scene_of, true_samples
 
 from polmvs.camera import pixel_centers
 from polmvs.normals.rows import gather_rows
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import as_tilted, turned
 from polmvs.scene import Seeds
-from polmvs.surface.integration import (
-    IntegrationTolerances,
-    open_lattice,
-    relax,
-    spread_nodes,
-    surface_at_seeds,
-    tie_to_consensus,
-)
-from polmvs.surface.pixel_graph import Nodes, lattice_edges, tie_seeds
+from polmvs.surface.pixel_graph import Nodes, tie_seeds
+from polmvs.surface.propagation import open_lattice, relax, spread_nodes, surface_at_seeds
 from polmvs.synthetic.captures import render_view, ring_of_views
 
 STRIDE = 4
@@ -31,11 +24,13 @@ def board():
     return board_scene(6)
 
 
-@pytest.fixture(scope="module")
-def exact():
-    """A board and the true dense views of it."""
-    scene = scene_of(BOARD, 5)
-    return scene, [true_view(scene, k) for k in range(5)]
+def lattice_edges(wanted):
+    """Pairs of neighbours in rows and columns of the wanted (h, w) points of a lattice."""
+    index = np.where(wanted, np.cumsum(wanted).reshape(wanted.shape) - 1, -1)
+    pairs = [(index[:, :-1], index[:, 1:]), (index[:-1], index[1:])]
+    tail = np.concatenate([a[(a >= 0) & (b >= 0)] for a, b in pairs])
+    head = np.concatenate([b[(a >= 0) & (b >= 0)] for a, b in pairs])
+    return tail, head
 
 
 def nodes_of(scene, k=0, stride=STRIDE):
@@ -54,90 +49,6 @@ def nodes_of(scene, k=0, stride=STRIDE):
         head=head,
         on_contour=np.zeros(len(tail), bool),
     )
-
-
-def moved(dense, away):
-    """A dense view whose surface lies farther away."""
-    known = dense.range_map > 0
-    return replace(dense, range_map=np.where(known, dense.range_map + away, 0).astype(np.float32))
-
-
-def test_others_tie_the_nodes_to_their_common_surface(exact):
-    scene, dense = exact
-    nodes = nodes_of(scene)
-    ties = tie_to_consensus(scene.maps, dense, nodes)
-    assert len(ties.node) > 0.7 * len(nodes.surface.xy)
-    np.testing.assert_allclose(ties.value, nodes.surface.log_range[ties.node], atol=1e-5)
-    assert len(np.unique(ties.seed)) == len(ties.seed)
-
-
-def test_one_other_view_ties_nothing(exact):
-    """Its error would come back to the view as another's agreement."""
-    scene, dense = exact
-    nodes = nodes_of(scene)
-    for others in ([None] * 4, [dense[1], None, None, None]):
-        assert len(tie_to_consensus(scene.maps, [dense[0], *others], nodes).node) == 0
-    assert (
-        len(tie_to_consensus(scene.maps, [None, dense[1], None, None, dense[4]], nodes).node) > 100
-    )
-
-
-def test_two_that_contradict_each_other_are_none(exact):
-    """By 20 times their deviation; the nearer one must not be taken for the truth."""
-    scene, dense = exact
-    nodes = nodes_of(scene)
-    # One alone can tell neither which of both is right nor whether it is.
-    two = [None, moved(dense[1], -0.01), None, None, dense[4]]
-    assert len(tie_to_consensus(scene.maps, two, nodes).node) == 0
-    within = [None, moved(dense[1], -0.0005), None, None, dense[4]]
-    assert len(tie_to_consensus(scene.maps, within, nodes).node) > 100
-
-
-@pytest.mark.parametrize("away", [-0.03, 0.03])
-def test_one_of_many_is_outvoted(exact, away):
-    scene, dense = exact
-    nodes = nodes_of(scene)
-    wrong = [dense[0], moved(dense[1], away), *dense[2:]]
-    ties = tie_to_consensus(scene.maps, wrong, nodes)
-    assert len(ties.node) > 0.5 * len(nodes.surface.xy)
-    error = np.abs(ties.value - nodes.surface.log_range[ties.node])
-    assert np.median(error) < 1e-5
-    assert (error < 1e-4).mean() > 0.9
-
-
-def test_a_sighting_of_another_surface_ties_nothing(exact):
-    """30 degrees between the normals: it sees what hides the node, or what lies behind it."""
-    scene, dense = exact
-    nodes = nodes_of(scene)
-    cos, sin = np.cos(np.radians(30)), np.sin(np.radians(30))
-    turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
-    turned = replace(nodes, surface=replace(nodes.surface, normals=nodes.surface.normals @ turn.T))
-    assert len(tie_to_consensus(scene.maps, dense, turned).node) == 0
-
-
-def test_sightings_within_reach_count_once(exact):
-    """On a denser lattice each tie is weaker, so that their sum over an area is the same."""
-    scene, dense = exact
-    sums = []
-    for stride in (2, 4):
-        ties = tie_to_consensus(scene.maps, dense, nodes_of(scene, stride=stride))
-        sums.append((1 / ties.sigma**2).sum())
-    assert sums[0] == pytest.approx(sums[1], rel=0.05)
-    nodes = nodes_of(scene, stride=4)
-    ties = tie_to_consensus(scene.maps, dense, nodes)
-    # Views that agree exactly: the deviation of one of them, along an oblique ray.
-    assert np.median(ties.sigma) == pytest.approx(
-        1.2e-3 * IntegrationTolerances().correlation_px / 4, rel=0.25
-    )
-
-
-def test_views_that_scatter_are_less_certain(exact):
-    scene, dense = exact
-    nodes = nodes_of(scene)
-    sharp = tie_to_consensus(scene.maps, dense, nodes)
-    spread = [moved(d, a) for d, a in zip(dense, (0, 0.004, -0.004, 0.002, -0.002), strict=True)]
-    blurred = tie_to_consensus(scene.maps, spread, nodes)
-    assert np.median(blurred.sigma) > 1.5 * np.median(sharp.sigma)
 
 
 def test_seeds_are_tied_along_chords_of_a_sphere():

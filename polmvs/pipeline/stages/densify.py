@@ -47,10 +47,8 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.poses.crop_box import CropBox
 from polmvs.scene import PointKind, Seeds, Tracks, View
 from polmvs.surface.camera_sigma import CameraModes, widen_by_poses
-from polmvs.surface.consensus import hidden_by
-from polmvs.surface.contour import propagate
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
-from polmvs.surface.fusion import FusedCloud, fuse, no_points
+from polmvs.surface.fusion import FusedCloud, fuse, hidden_by, no_points
 from polmvs.surface.global_surface import (
     SparsePoints,
     SurfacePoints,
@@ -61,10 +59,10 @@ from polmvs.surface.global_surface import (
     supported_mesh,
     surface_points,
 )
-from polmvs.surface.integration import integrate, plan_rounds
 from polmvs.surface.kept_depth import kept_cloud
 from polmvs.surface.mesh_geometry import RayScene
 from polmvs.surface.observations import Looking
+from polmvs.surface.propagation import propagate
 from polmvs.surface.surroundings import SparseSurroundings, sparse_surroundings, stereo_surroundings
 
 logger = logging.getLogger(__name__)
@@ -72,19 +70,18 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T", bound=np.generic)
 
 # Options that a method ignores.
-_OF_CONTOURS = ("propagation.contour", "propagation.step_px", "propagation.spacing_px")
-_INFERRED = "fusion.inferred"
 UNUSED: Mapping[Method, tuple[str, ...]] = {
     Method.SURFACE: (
-        *_OF_CONTOURS,
+        "propagation.contour",
+        "propagation.step_px",
+        "propagation.spacing_px",
         "propagation.num_rounds",
         "propagation.bending",
         "propagation.max_neighbors",
         "fusion.max_range_difference_px",
         "fusion.max_normal_difference_deg",
     ),
-    Method.INTEGRATE: (*_OF_CONTOURS, _INFERRED),
-    Method.CONTOUR: (_INFERRED,),
+    Method.CONTOUR: ("fusion.inferred",),
 }
 
 OUTSIDE = "{name}.outside.npy"  # among dense views: pixels that show nothing within the box
@@ -322,7 +319,7 @@ def _global_surface(
     )
     if isinstance(surface, Undetermined):
         logger.warning(
-            "%s: no surface from all views, for %s; views are integrated one by one.",
+            "%s: no surface from all views, for %s; contours carry the seeds' ranges in each view.",
             model,
             surface.reason,
         )
@@ -361,13 +358,10 @@ def _global_surface(
 def _dense_surface(given: _Inputs, folder: Path, views: Path) -> _Surface:
     """The fused surfaces of views one by one; what each view confirms of them goes to ``views``."""
     maps, options = given.maps, given.options.propagation
-    is_contour = options.method is Method.CONTOUR
-    method = Method.CONTOUR if is_contour else Method.INTEGRATE
     num_inside = sum(int(phase_map.region.inside.sum()) for phase_map in maps)
     if num_inside == 0 or len(given.seeds.sigma) == 0:
-        return _Surface(cloud=no_points(), method=method)
-    spread = propagate if is_contour else integrate
-    dense = spread(
+        return _Surface(cloud=no_points(), method=Method.CONTOUR)
+    dense = propagate(
         given.model.formula,
         maps,
         given.seeds,
@@ -392,15 +386,13 @@ def _dense_surface(given: _Inputs, folder: Path, views: Path) -> _Surface:
         assert dense_view is not None  # has points
         seen = points & ~hidden_by(dense_view, view, cloud.points, cloud.normals)
         store_dense_view(dense_view.only(seen), views / view.name)
-    return _Surface(cloud=cloud, method=method)
+    return _Surface(cloud=cloud, method=Method.CONTOUR)
 
 
 def num_densify_steps(num_views: int, options: PropagationOptions) -> int:
     """Number of steps that :func:`densify` reports."""
     if options.method is Method.SURFACE:
         return num_surface_steps(num_views)
-    if options.method is Method.INTEGRATE:
-        return (len(plan_rounds(options)) + 1) * num_views
     return (options.num_rounds + 2) * num_views
 
 

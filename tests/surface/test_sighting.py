@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from true_views import BALL, BOARD, SIGMA, scene_of, true_samples, true_view
 
-from polmvs.surface.consensus import hidden_by, sight, surface_of_others
+from polmvs.surface.fusion import hidden_by, sight
 
 
 def sighted(scene, dense, away=0.0, turn=None):
@@ -112,31 +112,6 @@ def test_outside_is_what_the_image_shows_beside_the_region():
     )
     np.testing.assert_array_equal(sighting.outside, [False, True, False, False])
     assert np.isnan(sighting.place[2:]).all()
-
-
-def test_the_others_surface_starts_a_view_that_knows_nothing():
-    scene = scene_of(BALL)
-    samples, _ = true_samples(scene, 0)
-    dense = [None, true_view(scene, 1), true_view(scene, 2)]
-    guess = surface_of_others(scene.maps, dense, samples.xy)
-    found = np.isfinite(guess.log_range)
-    assert found.mean() > 0.7
-    # At the rim, where the range changes by much from pixel to pixel, it is a guess indeed.
-    error = np.abs(np.exp(guess.log_range) - np.exp(samples.log_range))[found]
-    slant = -(samples.rays_in_world * samples.normals).sum(axis=-1)[found]
-    assert error[slant > 0.4].max() < 0.004  # a gsd of half a metre
-    assert (guess.normals[found] * samples.normals[found]).sum(-1)[slant > 0.4].min() > 0.99
-
-
-def test_no_others_no_start():
-    scene = scene_of(BOARD)
-    xy = true_samples(scene, 0)[0].xy
-    assert surface_of_others(scene.maps, [None] * 3, xy) is None
-    region = scene.maps[0].region
-    nowhere = replace(region, inside=np.zeros_like(region.inside))
-    hidden = replace(scene.maps[0], region=nowhere)
-    dense = [None, true_view(scene, 1), None]
-    assert surface_of_others([hidden, *scene.maps[1:]], dense, xy) is None
 
 
 def test_what_lies_behind_another_surface_is_hidden():
