@@ -69,6 +69,8 @@ THICKNESS_RATIO = 1.25  # of neighbours among the thicknesses that are tried
 THINNEST = -2  # exponent of the ratio, over the width of the rounding: about two cells of the mesh
 NUM_SECTORS = 8  # around an opening
 RIM_CELLS = 8  # across a rounded rim, whose normals turn by 180 deg; half as many to find it
+DEPTH_RATIO = 1.1  # of neighbours among the depths that are tried
+THICK_BOTTOM = 4  # exponent of that ratio for a bottom as thick as a third of the depth
 RIM_RATIO = 1.08  # as 1.25, of a rounded rim: its phases contradict a tenth more or less
 TOP_SECTORS = 36  # in each of which the top of a wall is sought
 PLANE_ROUNDS = 3  # of the fit of a plane to half of a border
@@ -162,6 +164,10 @@ class Cavity:
         """Its part above a floor at a depth below the rim."""
         floor = (depth - self.depths).astype(np.float32)
         return replace(self, field=np.minimum(self.field, floor[:, None, None]))
+
+    def shallower(self, share: float) -> Cavity:
+        """The cavity with all its depths times a share."""
+        return replace(self, layer_step=share * self.layer_step)
 
     def values(self, points: Floats) -> Array:
         """Signed distance ``(N,)`` of points, positive in the cavity's free space."""
@@ -338,16 +344,20 @@ def find_vessel(scene: RayScene, top: SupportingPlane, gsd: float, gain: Gain) -
     )
     within = _cavities_within(surface, opening, rim)
 
-    def cavity_of(thickness: float, sigma: float = 0.0) -> Cavity | None:
+    def cavity_of(number: float, thickness: float, sigma: float = 0.0) -> Cavity | None:
+        """Of a depth, as a power of a ratio of that with a bottom as thick as the wall."""
         cavity = within(False, thickness, sigma)
         # Many reflections bias the phases in a deep one: `find_cavities` infers its wall.
-        return None if cavity is None or cavity.is_deep else cavity
+        is_shallow = cavity is not None and not cavity.is_deep
+        return cavity.shallower(DEPTH_RATIO**-number) if cavity and is_shallow else None
 
-    likeliest = _likeliest_thickness(cavity_of, gain)
-    # Neither the solid nor the vessel is refined, so errors of their shapes have a part in the sum.
-    if likeliest is None or not likeliest.views_agree:
-        return None
-    return cavity_of(likeliest.thickness, likeliest.sigma)
+    for start in (0, THICK_BOTTOM):
+        likeliest = _likeliest_thickness(partial(cavity_of, start), gain)
+        # Neither solid nor vessel is refined, so errors of their shapes have a part in the sum.
+        if likeliest is not None and likeliest.views_agree:
+            of_wall = partial(cavity_of, thickness=likeliest.thickness, sigma=likeliest.sigma)
+            return _likeliest_depth(of_wall, start, gain)
+    return None
 
 
 def _least_area(gsd: float) -> float:
@@ -475,6 +485,26 @@ def _likeliest_thickness(
     shift, sigma = _vertex(gains[best - 1], gains[best], gains[best + 1])
     thickness = thickness_of(best + shift)
     return _Thickness(thickness, thickness * (THICKNESS_RATIO**sigma - 1), gains[best])
+
+
+def _likeliest_depth(
+    cavity_of: Callable[[float], Cavity | None], start: int, gain: Gain
+) -> Cavity | None:
+    """The cavity whose bottom is as thick as the phases show: as the wall, or thicker.
+
+    All depths change together, so a round bottom stays round and upright walls stay upright.
+    """
+
+    @cache
+    def information(number: int) -> Array:
+        cavity = cavity_of(number) if number >= 0 else None
+        return np.array([-np.inf]) if cavity is None else gain(cavity)
+
+    best = start
+    for step in (1, -1):
+        while information(best + step).sum() > information(best).sum():
+            best += step
+    return cavity_of(best + _vertex(*(information(best + step) for step in (-1, 0, 1)))[0])
 
 
 def _vertex(below: Array, here: Array, above: Array) -> tuple[float, float]:
