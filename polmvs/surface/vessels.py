@@ -3,7 +3,7 @@
 Silhouettes close the opening of a vessel with a cap. Over a bowl it lies so far from the inside
 that the refinement does not get there. So the likelihood of the phases decides before it: the
 object is solid (the hull, or the hull cut at its rim, as a plate or a box), or a vessel with a wall
-of one thickness. The refinement then moves the inside like any surface.
+of one thickness and a bottom of another. The refinement then moves the inside like any surface.
 """
 
 from __future__ import annotations
@@ -29,6 +29,11 @@ from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.visual_hull import SupportingPlane, VisualHull
 
 Array = NDArray[np.float64]
+
+# Of a silhouette's rays, whose height is that of the rim: some pass through what it holds wrongly.
+# Measured on four bowls: rims 50 to 92 mm high to 0.6 mm; the highest ray of a view errs by up to
+# 31 mm.
+TOP_SHARE = 0.999
 
 
 def opened_hull(
@@ -87,8 +92,8 @@ def rim_height(scene: RayScene, views: Sequence[SurfaceView], plane: SupportingP
     """The least height above a plane that an object with these silhouettes has.
 
     A ray within a silhouette meets the object between the ends of its way through the hull, so the
-    object is as high as the lower end. The highest one of a view is that of the rim, if a vessel is
-    open; the median over the views ignores wrong silhouettes. NaN without silhouettes.
+    object is as high as the lower end. The highest ones of a view are those of the rim, if a vessel
+    is open; the median over the views ignores wrong silhouettes. NaN without silhouettes.
 
     Parameters
     ----------
@@ -108,5 +113,5 @@ def rim_height(scene: RayScene, views: Sequence[SurfaceView], plane: SupportingP
         behind = scene.cast(view.center + far * rays, -rays).distance
         last = np.where(np.isfinite(behind), far - behind, entry)
         heights = [plane.height(points_on_rays(view.center, rays, end)) for end in (entry, last)]
-        found.append(float(np.minimum(*heights).max()))
+        found.append(float(np.quantile(np.minimum(*heights), TOP_SHARE)))
     return float(np.median(found)) if found else float("nan")

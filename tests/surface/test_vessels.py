@@ -1,15 +1,17 @@
 """The first surface of bowls, and of solids with the same silhouettes."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from analytic_objects import phase_maps_of, ring_of_views
+from scipy.spatial import ConvexHull
 
-from polmvs.camera import PinholeCamera
+from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.polarization.kinds import AngleModel
 from polmvs.surface.cavities import find_vessel
-from polmvs.surface.mesh_geometry import RayScene
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import Looking
 from polmvs.surface.solver import first_fit
 from polmvs.surface.surface_view import Silhouette, surface_view
@@ -76,6 +78,37 @@ def test_silhouettes_show_the_height_of_the_rim(of_bowl):
     height = rim_height(RayScene(hull.mesh), fit.views, GROUND)
     assert height == pytest.approx(1, abs=2 * hull.gsd)
     assert cap > height + 5 * hull.gsd
+
+
+def meet_half_ball(center, rays):
+    """Which rays (..., 3) from a center (3,) meet the half ball: its ball below the rim's plane."""
+    along = rays @ center
+    root = np.sqrt(np.maximum(along**2 - (center @ center - 1), 0))
+    heights = [center[2] + (-along + sign * root) * rays[..., 2] for sign in (-1, 1)]
+    return (root > 0) & (np.minimum(*heights) < 0)
+
+
+def test_what_silhouettes_hold_wrongly_is_no_rim(of_bowl):
+    """In each view a small block floats behind the bowl, above the rim."""
+    hull, _ = of_bowl
+    camera = PinholeCamera(width=792, height=672, fx=900, fy=900, cx=396, cy=336)
+    views = [replace(view, camera=camera) for view in ring_of_views(8, elevations=(20.0, 50.0))]
+    corners = 0.015 * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    sides = ConvexHull(corners).simplices
+    vertices, faces, seen = [hull.mesh.vertices], [hull.mesh.faces], []
+    for view in views:
+        away = -view.center_in_world[:2] / np.linalg.norm(view.center_in_world[:2])
+        block = corners + np.array((1.25 * away[0], 1.25 * away[1], 0.25))
+        faces.append(sides + sum(len(own) for own in vertices))
+        vertices.append(block)
+        center = view.center_in_world
+        rays = view.rays_in_world(pixel_centers(camera.width, camera.height))
+        hit = RayScene(TriangleMesh(block, sides)).cast(center, rays.reshape(-1, 3)).distance
+        mask = meet_half_ball(center, rays) | np.isfinite(hit).reshape(rays.shape[:2])
+        silhouette = Silhouette(mask, mask)
+        seen.append(SimpleNamespace(view=view, center=center, silhouette=silhouette))
+    scene = RayScene(TriangleMesh(np.concatenate(vertices), np.concatenate(faces)))
+    assert rim_height(scene, seen, GROUND) == pytest.approx(1, abs=hull.step)
 
 
 def test_no_silhouette_shows_no_height(of_bowl):
