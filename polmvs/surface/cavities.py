@@ -345,11 +345,12 @@ def find_vessel(scene: RayScene, top: SupportingPlane, gsd: float, gain: Gain) -
     within = _cavities_within(surface, opening, rim)
 
     def cavity_of(number: float, thickness: float, sigma: float = 0.0) -> Cavity | None:
-        """Of a depth, as a power of a ratio of that with a bottom as thick as the wall."""
+        """A cavity ``number`` steps shallower than with a bottom as thick as its wall."""
         cavity = within(False, thickness, sigma)
         # Many reflections bias the phases in a deep one: `find_cavities` infers its wall.
-        is_shallow = cavity is not None and not cavity.is_deep
-        return cavity.shallower(DEPTH_RATIO**-number) if cavity and is_shallow else None
+        if cavity is None or cavity.is_deep:
+            return None
+        return cavity.shallower(DEPTH_RATIO**-number)
 
     for start in (0, THICK_BOTTOM):
         likeliest = _likeliest_thickness(partial(cavity_of, start), gain)

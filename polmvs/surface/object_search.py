@@ -164,9 +164,7 @@ def find_object(
     features = [tracks.obs_xy[seen] for seen in tracks.of_views(len(maps))]
     for scale in (2, 1):
         shown = _shown_plane(maps, plane, near, scale, shown)
-        small = _with_extent(
-            _without_vignetting(shown.views, shown.textured), shown.textured, plane
-        )
+        small = _with_extent(shown.views, shown.textured, plane)
         shown = replace(shown, views=small)
         clues = [
             _Clues(*own) for own in zip(small, shown.shows_plane, strengths, features, strict=True)
@@ -180,6 +178,8 @@ def find_object(
         if not _views_to_search(small, masks, shown.textured):
             return None
         cells = coarse.finer()
+    small = _without_vignetting(small, shown.textured)
+    shown = replace(shown, views=small)
     for _ in range(TOL.num_rounds):
         plates = _plates(small, masks)
         odds = _background_odds(shown, plates, masks)

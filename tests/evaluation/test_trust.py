@@ -224,7 +224,7 @@ def test_what_closes_an_open_scene_is_a_reservation():
     assert "But surface that its phases contradict, %: 20 " in found.verdict
 
 
-def test_views_integrated_one_by_one_say_that_none_was_held_out():
+def test_without_a_surface_of_all_views_none_was_held_out():
     found = replace(RIGHT, predicted=None, fitted=None, soundness=None).judged()
     assert found.is_trusted
     assert "no view was held out as a check" in found.verdict

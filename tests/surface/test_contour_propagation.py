@@ -10,7 +10,6 @@ from polmvs.config import (
     FusionOptions,
     PropagationOptions,
 )
-from polmvs.parallel import Workers
 from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
 from polmvs.surface.dense_view import DenseView, open_dense_view, store_dense_view
@@ -55,66 +54,6 @@ def test_a_wrong_seed_does_not_dent_the_surface(scene, tmp_path):
         scene.maps, propagate(AngleModel.PPA, scene.maps, bad, OPTIONS, tmp_path), FusionOptions()
     )
     assert np.abs(distances(scene, cloud.points)).max() < 0.003
-
-
-def test_no_seed_no_surface(scene, tmp_path):
-    none = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    dense = propagate(AngleModel.PPA, scene.maps, none, OPTIONS, tmp_path)
-    assert dense == [None] * len(scene.maps)
-    assert len(fuse(scene.maps, dense, FusionOptions()).points) == 0
-
-
-def test_the_frame_and_scale_of_the_world_do_not_matter(scene, tmp_path):
-    """The same scene in another world gives the same surface there."""
-    from dataclasses import replace
-
-    from polmvs.geometry import RigidTransform
-
-    rotation = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    rotation *= np.sign(np.linalg.det(rotation))
-    shift, scale = np.array([3.0, -2.0, 1.0]), 7.0
-
-    def moved(view):
-        pose = view.cam_from_world
-        turned = pose.rotation @ rotation.T
-        translation = scale * pose.translation - turned @ shift
-        return replace(view, cam_from_world=RigidTransform(turned, translation))
-
-    seeds = scene.seeds(8)
-    other_maps = [replace(m, view=moved(m.view)) for m in scene.maps]
-    other_seeds = Seeds(
-        scale * seeds.points_in_world @ rotation.T + shift,
-        seeds.normals_in_world @ rotation.T,
-        scale * seeds.sigma,
-    )
-    here = propagate(AngleModel.PPA, scene.maps, seeds, OPTIONS, tmp_path / "here")
-    there = propagate(AngleModel.PPA, other_maps, other_seeds, OPTIONS, tmp_path / "there")
-    for a, b in zip(here, there, strict=True):
-        known = a.range_map > 0
-        np.testing.assert_allclose(b.range_map[known], scale * a.range_map[known], rtol=2e-4)
-
-
-def test_workers_give_the_same_result_as_one_process(scene, tmp_path):
-    from polmvs.polarization.phase_map import store_phase_map
-
-    for name in ("maps", "one", "two"):
-        (tmp_path / name).mkdir()
-    maps = [store_phase_map(m, tmp_path / "maps") for m in scene.maps]
-    counts = []
-    with Workers(2) as workers:
-        parallel = propagate(
-            AngleModel.PPA,
-            maps,
-            scene.seeds(8),
-            OPTIONS,
-            tmp_path / "two",
-            workers=workers,
-            on_progress=counts.append,
-        )
-    serial = propagate(AngleModel.PPA, maps, scene.seeds(8), OPTIONS, tmp_path / "one")
-    assert sum(counts) == len(maps) * (OPTIONS.num_rounds + 1)
-    for a, b in zip(serial, parallel, strict=True):
-        np.testing.assert_array_equal(a.range_map, b.range_map)
 
 
 def plane_view(scene, k, offset=0.0):

@@ -103,7 +103,9 @@ def test_wrong_seeds_lose(scene, tmp_path):
 
 def test_no_seeds_no_surface(scene, tmp_path):
     none = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    assert propagate(AngleModel.PPA, scene.maps, none, OPTIONS, tmp_path) == [None] * 6
+    dense = propagate(AngleModel.PPA, scene.maps, none, OPTIONS, tmp_path)
+    assert dense == [None] * 6
+    assert len(fuse(scene.maps, dense, FusionOptions()).points) == 0
 
 
 def test_frame_and_scale_of_the_world_do_not_matter(scene, dense, tmp_path):
@@ -203,7 +205,7 @@ def test_a_sphere_neither_bulges_nor_flattens(tmp_path):
     assert rmse(ranges) < SEED_TIE
     assert abs(np.median(ranges)) < 0.25 * SEED_TIE
     # A pixel turns the normal by 0.7 deg, and a lattice point lies up to a pixel from the nodes.
-    assert np.median(turns) < 0.35
+    assert np.median(turns) < 0.2
     assert found.min() > 0.9
 
 
