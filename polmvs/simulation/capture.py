@@ -43,7 +43,7 @@ from polmvs.simulation.irradiance import bake
 from polmvs.simulation.lights import environment
 from polmvs.simulation.marks import Marks, marks_at, marks_on
 from polmvs.simulation.materials import material_of, varnish_of
-from polmvs.simulation.mesh_input import ObjectMesh, object_mesh
+from polmvs.simulation.mesh_input import PLACES, ObjectMesh, object_mesh
 from polmvs.simulation.options import (
     LightName,
     ObjectOptions,
@@ -70,7 +70,6 @@ METERED_STEP = 13  # samples between two that are metered; coprime with the mosa
 METERED_PERCENTILE, METERED_LEVEL = 99.0, 0.85  # of the light, and its level in full scales
 CHECKED_SIDE = 96  # px, size of the images that check the views before rendering
 MIN_SEEN = 50  # px of these that must show the object: 0.5 %
-PLACES = 30  # spacing of baked light on the object, of its size
 MOVING_SHARE = 4  # by which directions are fewer where light is baked for each view
 
 

@@ -57,6 +57,7 @@ def bake(scene: MitsubaScene, *, bounces: int, samples: int, spacing: float, see
             values = gathered
         parameters = mi.traverse(shape)
         parameters["vertex_irradiance"] = np.asarray(values, np.float32)
+        parameters["face_irradiance"] = values[mesh.triangles].mean(axis=1).astype(np.float32)
         parameters.update()
 
 

@@ -3,7 +3,8 @@
 Shading follows the normals of a mesh, ground truth its triangles: with normals interpolated over
 coarse triangles, the shading would belong to another surface than the depths. So a file is rendered
 with the normals of its facets, or as a fine subdivision surface (Loop) whose facets and normals
-agree to a fraction of a millimetre; the difference is measured and reported.
+agree to a fraction of a millimetre; the difference is measured and reported. Large facets are
+halved: light is computed at vertices, so a shadow on a facet without any would be lost.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from polmvs.arrays import Array
 from polmvs.errors import DataError, OptionError
-from polmvs.geometry import unit
+from polmvs.geometry import lengths, unit
 from polmvs.io.clouds import Mesh
 from polmvs.io.mesh_files import linear_of_display
 from polmvs.simulation.options import Facets, ObjectOptions
@@ -31,6 +32,7 @@ DEFAULT_SIZE = 0.2  # metres
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 METRIC_SUFFIXES = (".glb", ".gltf")  # whose format says metres
 MAX_TRIANGLES = 1_500_000  # 2 GB at the most
+PLACES = 30  # vertices along the object at which light is computed, or more
 FINE_TRIANGLES = 200_000  # limit of a subdivision
 FINE_SAG = 2e-4  # of the size, between facets and their normals: 40 um at 0.2 m
 LARGEST_M, SMALLEST_M = 20.0, 0.002  # beyond which a file's unit is doubtful
@@ -158,23 +160,42 @@ def _surface(
         trimesh.repair.fix_normals(mesh, multibody=True)
     if options.facets is Facets.SMOOTH:
         return _subdivided(path, mesh, vertices, colours)
-    corners = np.asarray(mesh.vertices)[mesh.faces]
-    normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    kept = None
+    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
     if colours is not None:
-        kept = _nearest(vertices, colours, corners.reshape(-1, 3))
+        own = _nearest(vertices, colours, corners.reshape(-1, 3))
+        corners = np.concatenate([corners, own.reshape(-1, 3, own.shape[1])], axis=2)
+    corners = _halved(corners, float(np.ptp(mesh.vertices, axis=0).max()) / PLACES)
+    places = corners[..., :3]
+    normals = unit(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]))
     flat = Mesh(
-        corners.reshape(-1, 3).copy(),
+        places.reshape(-1, 3).copy(),
         np.repeat(normals, 3, axis=0),
-        np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3),
+        np.arange(3 * len(places), dtype=np.int32).reshape(-1, 3),
     )
-    return flat, kept
+    return flat, None if colours is None else corners[..., 3:].reshape(-1, 3).astype(np.float32)
+
+
+def _halved(corners: Array, longest: float) -> Array:
+    """Facets (F, 3, 3 + C), positions and C colours, halved until no edge is longer."""
+    done = []
+    while len(corners):
+        places = corners[..., :3]
+        edges = lengths(np.roll(places, -1, axis=1) - places)
+        is_short = edges.max(axis=1) <= longest
+        done.append(corners[is_short])
+        turned = (edges[~is_short].argmax(axis=1)[:, None] + np.arange(3)) % 3
+        corners = np.take_along_axis(corners[~is_short], turned[..., None], axis=1)
+        start, end, apex = np.moveaxis(corners, 1, 0)
+        middle = 0.5 * (start + end)
+        halves = (start, middle, apex), (middle, end, apex)
+        corners = np.concatenate([np.stack(half, axis=1) for half in halves])
+    return np.concatenate(done)
 
 
 def _subdivided(
     path: Path, mesh: Any, vertices: Array, colours: NDArray[np.float32] | None
 ) -> tuple[Mesh, NDArray[np.float32] | None]:
-    """Loop's subdivision until facets and normals agree, or the triangles are many."""
+    """Loop's subdivision until facets are small and agree with normals, or there are many."""
     size = float(np.ptp(np.asarray(mesh.vertices), axis=0).max())
     while True:
         smooth = Mesh(
@@ -183,7 +204,8 @@ def _subdivided(
             np.asarray(mesh.faces, np.int32),
         )
         sag = surface_sag(smooth)
-        if sag <= FINE_SAG * size or 4 * len(mesh.faces) > FINE_TRIANGLES:
+        is_fine = sag <= FINE_SAG * size and float(mesh.edges_unique_length.max()) <= size / PLACES
+        if is_fine or 4 * len(mesh.faces) > FINE_TRIANGLES:
             break
         mesh = mesh.subdivide_loop(iterations=1)
     kept = None if colours is None else _nearest(vertices, colours, smooth.vertices)

@@ -101,9 +101,7 @@ def build_scene(
     albedo = _albedo_texture(renderer, description)
     bsdf = bsdf_of(material, colour=description.colour)
     if description.vertex_albedo is not None and material.metal is None:
-        bsdf["diffuse_reflectance"] = vertex_albedo(
-            renderer, float(description.vertex_albedo.mean())
-        )
+        bsdf["diffuse_reflectance"] = _of_vertices(renderer, description.vertex_albedo)
     part = _shape(renderer, description.part, mi.load_dict(bsdf))
     if description.vertex_albedo is not None:
         colours = description.vertex_albedo
@@ -152,16 +150,22 @@ def _albedo_texture(renderer: Renderer, description: SceneDescription) -> Any:
     if material.metal is not None:
         return None
     if description.vertex_albedo is not None:
-        return renderer.mi.load_dict({"type": "mesh_attribute", "name": ATTRIBUTE})
+        return renderer.mi.load_dict(_of_vertices(renderer, description.vertex_albedo))
     return renderer.mi.load_dict(
         bsdf_of(material, colour=description.colour)["diffuse_reflectance"]
     )
 
 
+def _of_vertices(renderer: Renderer, albedo: NDArray[np.float32]) -> dict[str, Any]:
+    """Texture of the vertices' own albedo."""
+    return vertex_albedo(renderer, float(albedo.mean()))
+
+
 def _shape(renderer: Renderer, mesh: Mesh, bsdf: Any, uv: NDArray[np.float32] | None = None) -> Any:
-    """A mesh of Mitsuba with a place for the irradiance of its vertices."""
+    """A mesh of Mitsuba with a place for the irradiance of its vertices and faces."""
     shape = _mitsuba_mesh(renderer, mesh, uv, mesh_bsdf=bsdf)
-    shape.add_attribute("vertex_irradiance", 1, np.zeros(len(mesh.vertices), np.float32))
+    for element, values in (("vertex", mesh.vertices), ("face", mesh.triangles)):
+        shape.add_attribute(f"{element}_irradiance", 1, np.zeros(len(values), np.float32))
     return shape
 
 

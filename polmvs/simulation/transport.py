@@ -261,9 +261,7 @@ def _follow(scene: MitsubaScene, ray: Any, sampler: Any, bounces: int) -> tuple[
         total = total + gathered(throughput, emitter.eval(hit, shining)[0, 0], shining)
         active = active & hit.is_valid() & ~shining
         is_part = active & (hit.shape == part)
-        irradiance = hit.shape.eval_attribute_1("vertex_irradiance", hit, active)
-        if scene.illuminant is not None:
-            irradiance = irradiance * _relative_illuminant(scene, hit, active)
+        irradiance = _irradiance(scene, hit, active)
         surface = hit.bsdf(ray)
         others = active & ~is_part
         lambertian = surface.eval(matte, hit, upright, others)
@@ -302,6 +300,20 @@ def _follow(scene: MitsubaScene, ray: Any, sampler: Any, bounces: int) -> tuple[
 def _gathered(mi: Any, dr: Any, light: Any, radiance: Any, lit: Any) -> Any:
     """Unpolarized light through what was met so far; its mean over wavelengths."""
     return dr.select(lit, mi.Vector3f(*(dr.mean(light[k, 0] * radiance) for k in range(3))), 0.0)
+
+
+def _irradiance(scene: MitsubaScene, hit: Any, active: Any) -> Any:
+    """Irradiance at places, interpolated between vertices; in slivers, that of the face.
+
+    If a face is 3,000 times as long as high, Mitsuba's float32 barycentric coordinates are NaN.
+    """
+    dr = scene.renderer.dr
+    found = hit.shape.eval_attribute_1("vertex_irradiance", hit, active)
+    of_face = hit.shape.eval_attribute_1("face_irradiance", hit, active)
+    found = dr.select(dr.isfinite(found), found, of_face)
+    if scene.illuminant is None:
+        return found
+    return found * _relative_illuminant(scene, hit, active)
 
 
 def _relative_illuminant(scene: MitsubaScene, hit: Any, active: Any) -> Any:

@@ -38,8 +38,9 @@ def _register(renderer: Renderer) -> None:
             self.share = float(properties["mean"])
 
         def eval(self, si: Any, active: Any = True) -> Any:
-            """Spectrum at a place."""
-            return self.attribute.eval(si, active)
+            """Spectrum at a place; in slivers, whose coordinates are NaN, the mean."""
+            dr, found = renderer.dr, self.attribute.eval(si, active)
+            return dr.select(dr.isfinite(found), found, self.share)
 
         def mean(self) -> Any:
             """Mean of the mesh."""

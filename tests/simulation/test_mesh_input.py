@@ -18,6 +18,11 @@ def sphere(subdivisions=2, radius=0.12):
     return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
 
 
+def area(corners):
+    sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return 0.5 * np.linalg.norm(np.cross(*sides), axis=1).sum()
+
+
 @pytest.mark.parametrize("suffix", ["ply", "obj", "stl", "glb"])
 def test_formats_give_the_same_object(tmp_path, suffix):
     path = tmp_path / f"part.{suffix}"
@@ -25,8 +30,8 @@ def test_formats_give_the_same_object(tmp_path, suffix):
     found = object_mesh(path, ObjectOptions())
     assert np.ptp(found.mesh.vertices, axis=0) == pytest.approx([0.24, 0.24, 0.24], rel=0.02)
     assert found.mesh.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
-    assert len(found.mesh.triangles) == 320
     corners = found.mesh.vertices[found.mesh.triangles]
+    assert area(corners) == pytest.approx(sphere().area, rel=1e-5)
     outwards = corners.mean(axis=1) - [0, 0, found.mesh.vertices[:, 2].max() / 2]
     assert ((found.mesh.normals[found.mesh.triangles[:, 0]] * outwards).sum(axis=1) > 0).all()
     assert surface_sag(found.mesh) == 0  # facets are what they are
@@ -89,6 +94,21 @@ def test_colours_of_vertices_become_linear_albedo(tmp_path):
     found = object_mesh(tmp_path / "part.ply", ObjectOptions())
     # 188 of 255 is half of the light in sRGB.
     np.testing.assert_allclose(found.vertex_albedo[0], [0.5, 0, 1], atol=0.005)
+
+
+def test_large_facets_are_halved_and_colours_stay_linear(tmp_path):
+    # A square of 0.2 m, red along x.
+    corners = np.array([[0, 0, 0], [0.2, 0, 0], [0.2, 0.2, 0], [0, 0.2, 0]])
+    square = trimesh.Trimesh(corners, [[0, 1, 2], [2, 3, 0]], process=False)
+    square.visual.vertex_colors = [[value, 0, 0, 255] for value in (0, 255, 255, 0)]
+    square.export(tmp_path / "square.ply")
+    found = object_mesh(tmp_path / "square.ply", ObjectOptions())
+    halved = found.mesh.vertices[found.mesh.triangles]
+    assert area(halved) == pytest.approx(0.04, rel=1e-6)
+    edges = np.linalg.norm(np.roll(halved, -1, axis=1) - halved, axis=2)
+    assert 0.5 * 0.2 / 30 < edges.max() <= 0.2 / 30
+    x = found.mesh.vertices[:, 0] - found.mesh.vertices[:, 0].min()
+    np.testing.assert_allclose(found.vertex_albedo[:, 0], x / 0.2, atol=0.01)
 
 
 def test_what_is_no_object_is_refused(tmp_path, monkeypatch):

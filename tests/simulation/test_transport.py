@@ -24,6 +24,7 @@ from traced_scenes import (
 
 from polmvs.camera import pixel_centers
 from polmvs.geometry import lengths, unit
+from polmvs.io.clouds import Mesh
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.mosaic import ANGLES_DEG
@@ -249,3 +250,26 @@ def test_a_varnished_table_shines_as_an_object_of_that_material(renderer, varnis
     else:
         np.testing.assert_allclose(found[use], stokes_of(as_object, view)[use], atol=0.002)
         assert np.median(lengths(found[use][:, 1:])) > 0.01
+
+
+def test_slivers_are_lit_as_other_faces(renderer):
+    """Strips 4,000 times as long as high, whose barycentric coordinates are NaN in float32."""
+    y = np.linspace(-0.1, 0.1, 4001)
+    corners = np.stack([np.tile([-0.1, 0.1], len(y)), np.repeat(y, 2)], axis=1)
+    first = 2 * np.arange(len(y) - 1)[:, None]
+    strips = Mesh(
+        np.insert(corners, 2, 0.1, axis=1),
+        np.tile([0.0, 0.0, 1.0], (len(corners), 1)),
+        (first + np.array([[0, 1, 3, 0, 3, 2]])).reshape(-1, 3).astype(np.int32),
+    )
+    halves = np.array([[0, 1, 3], [0, 3, 2]], np.int32)
+    whole = Mesh(strips.vertices[[0, 1, -2, -1]], strips.normals[:4], halves)
+    paper = Material(roughness=SMOOTH, ior=1.5, albedo=(0.5,) * 3)
+    view = view_of()
+    of_strips, of_whole = (
+        stokes_of(lit_scene(renderer, mesh, paper), view) for mesh in (strips, whole)
+    )
+    _, _, mask = true_maps(lit_scene(renderer, whole, paper, samples=4), view)
+    assert mask.sum() > 1000
+    # One ray in 16 of few pixels meets two strips.
+    np.testing.assert_allclose(of_strips[mask], of_whole[mask], atol=0.05)
