@@ -28,6 +28,7 @@ Across = Callable[[Array, Array], tuple[Array, Array]]
 MIN_POINTS = 8  # points of a curve: with fewer it has no direction
 BEYOND = 12  # cells: farther than edges are searched
 SUBDIVISIONS = 8  # of a curve's pieces, for distances to it
+FRACTION_BITS = 8  # of coordinates in OpenCV's polygons
 LEAST_TURN = 1e-4  # radians, of the reweighting: straight for all that is seen
 
 
@@ -207,8 +208,18 @@ def _distance_to(curves: Sequence[Array], slope: Array) -> Array:
     far, nearest = cKDTree(nodes).query(cells)
     height = dots(cells - nodes[nearest], normals[nearest])
     beside = np.sqrt(np.maximum(far**2 - height**2, 0))
-    signed = np.where(beside <= 1 / SUBDIVISIONS, height, np.copysign(far, height))
-    return np.asarray(signed.reshape(shape))
+    near = np.where(beside <= 1 / SUBDIVISIONS, height, np.copysign(far, height))
+    # At a kink the nearest normal may look to the wrong side: it tells only the nearest cells.
+    outside = 1.0 - 2 * _filled(curves, shape).ravel()
+    return np.asarray(np.where(far < 1, near, far * outside).reshape(shape))
+
+
+def _filled(curves: Sequence[Array], shape: tuple[int, ...]) -> Mask:
+    """Cells (H, W) within closed curves, those of holes left out; by chance along the curves."""
+    image = np.zeros(shape, np.uint8)
+    corners = [np.rint(curve[:, ::-1] * 2**FRACTION_BITS).astype(np.int32) for curve in curves]
+    cv2.fillPoly(image, corners, 1, shift=FRACTION_BITS)
+    return image == 1
 
 
 def _slope(image: Array) -> Array:
