@@ -104,7 +104,7 @@ def phase_variance(
     """
     t = tolerances
     signal = np.maximum(np.square(dolp) - 2 * variance, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         found = t.model_sigma**2 + (t.mixture_sigma**2 + variance / 4) / signal
     return np.where(signal > 0, found, np.inf).astype(np.result_type(dolp), copy=False)
 

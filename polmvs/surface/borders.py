@@ -219,7 +219,7 @@ def _filled(curves: Sequence[Array], shape: tuple[int, ...]) -> Mask:
     image = np.zeros(shape, np.uint8)
     corners = [np.rint(curve[:, ::-1] * 2**FRACTION_BITS).astype(np.int32) for curve in curves]
     cv2.fillPoly(image, corners, 1, shift=FRACTION_BITS)
-    return image == 1
+    return np.asarray(image == 1)
 
 
 def _slope(image: Array) -> Array:
