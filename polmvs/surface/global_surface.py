@@ -145,6 +145,7 @@ class GlobalSurface:
     left_out : (K,) bool, inconsistent views; the surface is made without them.
     levels : the first surface, and the mesh after each level of refinement.
     is_bounded : by silhouettes; otherwise it is that of an open scene.
+    is_vessel : open at the top from the start.
     """
 
     mesh: TriangleMesh
@@ -162,6 +163,7 @@ class GlobalSurface:
     left_out: Mask
     levels: tuple[TriangleMesh, ...] = ()
     is_bounded: bool = True
+    is_vessel: bool = False
 
     def shown(self) -> GlobalSurface:
         """The surface without the inferred faces."""
@@ -271,7 +273,8 @@ def reconstruct_surface(
     if free is not None:
         polished = replace(_unbiased(polished, first.known), fit=refined.fit)
     surface = _supported(given, polished, steps, cavities, refined.left_out)
-    surface = replace(surface, levels=(first.mesh, *refined.meshes))
+    levels, is_vessel = (first.mesh, *refined.meshes), first.walls is not None
+    surface = replace(surface, levels=levels, is_vessel=is_vessel)
     if first.hull is not None:
         return surface
     # The silhouettes of an open scene are its first surface, not what the views show of objects.

@@ -15,7 +15,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.geometry import dots, points_on_rays
+from polmvs.geometry import dots, lengths, points_on_rays
 from polmvs.polarization.kinds import Light
 from polmvs.scene import MIN_VIEWS
 from polmvs.surface.dense_view import lattice_xy
@@ -96,6 +96,8 @@ class Prediction:
     overlap : intersection over union of silhouettes and their predictions; unknown pixels are
         ignored.
     views : errors of each view that has enough phases.
+    moved : share of the surface of all views that lies farther than a coarse edge from the
+        predicting one; None if they cannot be compared.
     """
 
     num_views: int
@@ -106,11 +108,38 @@ class Prediction:
     unexplained: float
     overlap: float
     views: tuple[ViewError, ...] = ()
+    moved: float | None = None
 
     def inconsistent_view(self, limit_deg: float) -> str | None:
         """The view, if exactly one of several, that is predicted worse than a limit."""
         found = [view.name for view in self.views if view.error_deg > limit_deg]
         return found[0] if len(found) == 1 < len(self.views) else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class WholeSurface:
+    """A surface of all views, to be compared with that of some.
+
+    Attributes
+    ----------
+    mesh : its measured faces.
+    refined : closed, before height steps and cavities were carved: the coarse one has none either.
+    is_vessel : whether it was open at the top from the start.
+    """
+
+    mesh: TriangleMesh
+    refined: TriangleMesh
+    is_vessel: bool
+
+    def moved_share(self, other: TriangleMesh, reach: float) -> float:
+        """Share of its area from which another mesh is farther than a reach."""
+        centers, area = self.mesh.centers, self.mesh.face_areas
+
+        def is_near(mesh: TriangleMesh) -> Mask:
+            return np.asarray(lengths(RayScene(mesh).closest(centers)[0] - centers) < reach)
+
+        moved = is_near(self.refined) & ~is_near(other)
+        return float(area[moved].sum() / max(float(area.sum()), 1e-300))
 
 
 def predict_left_out(
@@ -120,6 +149,7 @@ def predict_left_out(
     known: KnownPoints,
     *,
     scene: OpenScene | None = None,
+    whole: WholeSurface | None = None,
     outside: Mapping[str, Mask] = MappingProxyType({}),
     tolerances: HeldOutTolerances | None = None,
 ) -> Prediction | None:
@@ -135,6 +165,9 @@ def predict_left_out(
     looking : angle model and the share of the tilt that the whole surface corrects.
     known : points of the surface.
     scene : the open scene of ``views``; None: silhouettes bound the objects.
+    whole : the surface of all views, if it is to be compared with that of the others. Where views
+        do not determine it, such as a hollow that every silhouette hides, it stays near the visual
+        hull, and this depends on the views.
     outside : pixels (H, W) of each view, by its name, that are not compared: they show what is
         outside the crop box.
 
@@ -162,7 +195,12 @@ def predict_left_out(
             solver = replace(SolverTolerances(), levels=levels)
             fit = first_fit(used, looking, first.gsd, known=known, tolerances=solver)
             mesh = refine(mesh, fit, walls=walls).mesh
-        return predict(mesh, others, looking, outside=outside, width_px=tol.width_px)
+        found = predict(mesh, others, looking, outside=outside, width_px=tol.width_px)
+        # Fewer views may not show that there is a vessel.
+        if whole is None or whole.is_vessel != (walls is not None) or not len(mesh.faces):
+            return found
+        moved = whole.moved_share(mesh, tol.levels[-1].edge_px * first.gsd)
+        return replace(found, moved=moved)
 
     found = trial(tol.levels)
     if found.error_deg > tol.doubtful_deg:

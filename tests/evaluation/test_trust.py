@@ -180,6 +180,7 @@ def test_noisy_phases_of_weak_polarization_are_no_contradiction():
         ({"predicted": replace(PREDICTED, error_deg=12.0)}, "median error.* 12 .*region.light"),
         ({"predicted": replace(PREDICTED, num_phases=20)}, "median error.* unknown"),
         ({"predicted": replace(PREDICTED, overlap=0.7)}, "overlap of their silhouettes.* 70 "),
+        ({"predicted": replace(PREDICTED, moved=0.17)}, "that moves without them, %: 17 "),
         ({"fitted": replace(PREDICTED, unexplained=0.5)}, "neither kind of light explains.* 50 "),
         ({"soundness": Soundness(layered=0.2, overlapping=0.0)}, "double layer.* 20 "),
         ({"soundness": Soundness(layered=0.0, overlapping=0.1)}, "intersects itself.* 10 "),

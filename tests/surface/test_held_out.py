@@ -9,7 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from polmvs.geometry import RigidTransform
 from polmvs.polarization.kinds import AngleModel, Light
-from polmvs.surface.held_out import HeldOutTolerances, Prediction, predict, predict_left_out
+from polmvs.surface.held_out import (
+    HeldOutTolerances,
+    Prediction,
+    WholeSurface,
+    predict,
+    predict_left_out,
+)
 from polmvs.surface.mesh_geometry import TriangleMesh
 from polmvs.surface.observations import Looking
 from polmvs.surface.solver import Level
@@ -148,6 +154,27 @@ def test_a_short_trial_that_fails_is_done_again_with_care(views) -> None:
     assert second is not None
     assert first.error_deg > FINE.doubtful_deg
     assert second.error_deg < 2.5
+
+
+def test_a_part_that_the_views_do_not_determine_moves_without_some(views) -> None:
+    right = extracted(ellipsoid, step=0.05)
+
+    def raised(points: np.ndarray) -> np.ndarray:
+        bump = np.linalg.norm(points - [0.0, 0.9, 0.0], axis=-1) - 0.5
+        return np.minimum(ellipsoid(points), bump)
+
+    wrong = extracted(raised, step=0.05)
+    wrong_area = wrong.face_areas[ellipsoid(wrong.centers) > 0.15].sum()
+
+    def moved(mesh: TriangleMesh, refined: TriangleMesh, *, is_vessel: bool = False):
+        whole = WholeSurface(mesh=mesh, refined=refined, is_vessel=is_vessel)
+        return predicted(views, whole=whole).moved
+
+    assert moved(right, right) < 0.01
+    assert moved(wrong, wrong) > 0.8 * wrong_area / wrong.face_areas.sum() > 0.05
+    assert moved(wrong, right) < 0.05  # what was carved or filled later has its own evidence
+    assert moved(right, right, is_vessel=True) is None
+    assert predicted(views).moved is None
 
 
 def test_a_silhouette_that_is_larger_overlaps_by_its_share() -> None:

@@ -102,6 +102,7 @@ class DensifyResult:
         None with the other methods.
     left_out : names of inconsistent views, which the surface does not use.
     is_bounded : silhouettes bound the surface of all views; otherwise it is that of an open scene.
+    is_vessel : the surface of all views was open at the top from the start.
     contradicted_share : share of the surface of all views that its phases contradict; None with the
         other methods.
     """
@@ -112,6 +113,7 @@ class DensifyResult:
     tilt_share: float | None
     left_out: tuple[str, ...] = ()
     is_bounded: bool = True
+    is_vessel: bool = False
     contradicted_share: float | None = None
 
     def __str__(self) -> str:
@@ -148,6 +150,7 @@ class _Surface:
     tilt_share: float | None = None
     left_out: tuple[str, ...] = ()
     is_bounded: bool = True
+    is_vessel: bool = False
     contradicted_share: float | None = None
 
 
@@ -222,6 +225,7 @@ def densify(
         tilt_share=found.tilt_share,
         left_out=found.left_out,
         is_bounded=found.is_bounded,
+        is_vessel=found.is_vessel,
         contradicted_share=found.contradicted_share,
     )
 
@@ -351,6 +355,7 @@ def _global_surface(
         tilt_share=surface.tilt_share,
         left_out=tuple(view.name for view in compress(given.views, surface.left_out)),
         is_bounded=surface.is_bounded,
+        is_vessel=surface.is_vessel,
         contradicted_share=surface.contradictions.contradicted_share,
     )
 

@@ -27,7 +27,7 @@ from polmvs.pipeline.stages.silhouettes import open_surface_views
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind, evenly_spread
-from polmvs.surface.held_out import HeldOutTolerances, predict, predict_left_out
+from polmvs.surface.held_out import HeldOutTolerances, WholeSurface, predict, predict_left_out
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import (
     DIFFUSE,
@@ -126,15 +126,22 @@ def _contradicted(
     mesh = TriangleMesh.of(read_mesh(views / SURFACE_MESH))
     kind = cloud.scalars["kind"][cKDTree(cloud.points).query(mesh.centers)[1]]
     measured = kind != PointKind.INFERRED
+    refined = TriangleMesh.of(read_mesh([views / SURFACE_MESH, *surface_levels(views)][-1]))
+    whole = None
+    if made.is_bounded:
+        of_measured = TriangleMesh(mesh.vertices, mesh.faces[measured])
+        whole = WholeSurface(mesh=of_measured, refined=refined, is_vessel=made.is_vessel)
     wrong_camera = _camera_complaint(mesh, kind == PointKind.SURFACE, seen, looking)
     return replace(
         trust,
         complaints=(*trust.complaints, *(() if wrong_camera is None else (wrong_camera,))),
-        predicted=predict_left_out(seen, plane, looking, known, scene=scene, outside=outside),
+        predicted=predict_left_out(
+            seen, plane, looking, known, scene=scene, whole=whole, outside=outside
+        ),
         fitted=predict(mesh, seen, looking, outside=outside, measured=measured),
         # Of the last closed mesh: the surface has holes where nothing is known.
         soundness=find_soundness(
-            TriangleMesh.of(read_mesh([views / SURFACE_MESH, *surface_levels(views)][-1])),
+            refined,
             [phase_map.view for phase_map in maps],
             outside,
         ),
