@@ -74,7 +74,7 @@ class NormalRanges:
     contradicted : share of the surface. Measured, 0 to 0.08; with normals or F-scores that are
         wrong 0.18 and 0.31, under OPA 0.12. The end is that of the surface's own warning.
     moved : share of the surface. Measured, 0 on board, dome, mug and step, to 0.05; of a figure
-        whose hollow back stayed at the visual hull 0.17. The end is that of ``contradicted``.
+        whose concave back stayed at the visual hull 0.17. The end is that of ``contradicted``.
     cut : measured, see :mod:`polmvs.polarization.mask_check`.
 
     Measured on right reconstructions: five rendered captures (``board``, ``dome``, ``demo``,
@@ -236,7 +236,7 @@ class Trust:
                 yield _figure(name, self.predicted.overlap, ranges.overlap, remedy)
             if self.predicted.moved is not None:
                 name = "held-out views: surface that moves without them, %"
-                remedy = "hollows that no outline shows; more views"
+                remedy = "concave parts that no outline shows; more views"
                 yield _figure(name, self.predicted.moved, ranges.moved, remedy)
         if self.fitted is not None:
             name = "phases that neither kind of light explains, %"

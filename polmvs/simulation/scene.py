@@ -101,7 +101,7 @@ def build_scene(
     albedo = _albedo_texture(renderer, description)
     bsdf = bsdf_of(material, colour=description.colour)
     if description.vertex_albedo is not None and material.metal is None:
-        bsdf["diffuse_reflectance"] = _of_vertices(renderer, description.vertex_albedo)
+        bsdf["diffuse_reflectance"] = vertex_albedo(renderer, description.vertex_albedo)
     part = _shape(renderer, description.part, mi.load_dict(bsdf))
     if description.vertex_albedo is not None:
         colours = description.vertex_albedo
@@ -150,15 +150,10 @@ def _albedo_texture(renderer: Renderer, description: SceneDescription) -> Any:
     if material.metal is not None:
         return None
     if description.vertex_albedo is not None:
-        return renderer.mi.load_dict(_of_vertices(renderer, description.vertex_albedo))
+        return renderer.mi.load_dict(vertex_albedo(renderer, description.vertex_albedo))
     return renderer.mi.load_dict(
         bsdf_of(material, colour=description.colour)["diffuse_reflectance"]
     )
-
-
-def _of_vertices(renderer: Renderer, albedo: NDArray[np.float32]) -> dict[str, Any]:
-    """Texture of the vertices' own albedo."""
-    return vertex_albedo(renderer, float(albedo.mean()))
 
 
 def _shape(renderer: Renderer, mesh: Mesh, bsdf: Any, uv: NDArray[np.float32] | None = None) -> Any:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from polmvs.simulation.renderer_import import Renderer
 
 ATTRIBUTE = "vertex_color"  # of Mitsuba's mesh
@@ -12,17 +15,18 @@ NAME = "vertex_albedo"
 _registered: set[str] = set()  # variants of the renderer
 
 
-def vertex_albedo(renderer: Renderer, mean: float) -> dict[str, Any]:
+def vertex_albedo(renderer: Renderer, albedo: NDArray[np.float32]) -> dict[str, Any]:
     """Description of a texture for Mitsuba: a mesh's attribute, which has no mean of its own.
 
     Parameters
     ----------
-    mean : of the albedo; from it a plastic tells how often to sample its gloss, and nothing else.
+    albedo : (V, 3) of the vertices. Their mean is that of slivers; from it a plastic also tells how
+        often to sample its gloss.
     """
     if renderer.variant not in _registered:
         _register(renderer)
         _registered.add(renderer.variant)
-    return {"type": NAME, "mean": mean}
+    return {"type": NAME, "mean": float(albedo.mean())}
 
 
 def _register(renderer: Renderer) -> None:

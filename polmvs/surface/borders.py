@@ -215,7 +215,7 @@ def _distance_to(curves: Sequence[Array], slope: Array) -> Array:
 
 
 def _filled(curves: Sequence[Array], shape: tuple[int, ...]) -> Mask:
-    """Cells (H, W) within closed curves, those of holes left out; by chance along the curves."""
+    """Cells (H, W) within closed curves, without their holes. Those on a curve may be either."""
     image = np.zeros(shape, np.uint8)
     corners = [np.rint(curve[:, ::-1] * 2**FRACTION_BITS).astype(np.int32) for curve in curves]
     cv2.fillPoly(image, corners, 1, shift=FRACTION_BITS)

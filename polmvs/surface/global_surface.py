@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from polmvs.camera import sample_image
-from polmvs.geometry import lengths
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.normals.tracks import evenly_chosen
@@ -497,7 +496,7 @@ def _polished(
     fitted = fit_normals(mesh, labelled)
     facing, is_wall = fitted.normals, np.zeros(len(mesh.faces), np.bool_)
     if carvings:
-        to_uncarved = lengths(RayScene(refined.mesh).closest(mesh.centers)[0] - mesh.centers)
+        to_uncarved = RayScene(refined.mesh).distance(mesh.centers).astype(np.float64)
         facing, is_wall = wall_normals(
             mesh,
             fitted.normals,

@@ -15,7 +15,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.geometry import dots, lengths, points_on_rays
+from polmvs.geometry import dots, points_on_rays
 from polmvs.polarization.kinds import Light
 from polmvs.scene import MIN_VIEWS
 from polmvs.surface.dense_view import lattice_xy
@@ -118,7 +118,7 @@ class Prediction:
 
 @dataclass(frozen=True, kw_only=True)
 class WholeSurface:
-    """A surface of all views, to be compared with that of some.
+    """A surface of all views, to compare with a surface of some of them.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class WholeSurface:
         centers, area = self.mesh.centers, self.mesh.face_areas
 
         def is_near(mesh: TriangleMesh) -> Mask:
-            return np.asarray(lengths(RayScene(mesh).closest(centers)[0] - centers) < reach)
+            return np.asarray(RayScene(mesh).distance(centers) < reach)
 
         moved = is_near(self.refined) & ~is_near(other)
         return float(area[moved].sum() / max(float(area.sum()), 1e-300))
@@ -165,9 +165,9 @@ def predict_left_out(
     looking : angle model and the share of the tilt that the whole surface corrects.
     known : points of the surface.
     scene : the open scene of ``views``; None: silhouettes bound the objects.
-    whole : the surface of all views, if it is to be compared with that of the others. Where views
-        do not determine it, such as a hollow that every silhouette hides, it stays near the visual
-        hull, and this depends on the views.
+    whole : the surface of all views, if it is to be compared with that of the others. A concave
+        part that neither outlines nor phases determine stays near the visual hull, which depends
+        on the views.
     outside : pixels (H, W) of each view, by its name, that are not compared: they show what is
         outside the crop box.
 

@@ -174,6 +174,7 @@ def test_a_part_that_the_views_do_not_determine_moves_without_some(views) -> Non
     assert moved(wrong, wrong) > 0.8 * wrong_area / wrong.face_areas.sum() > 0.05
     assert moved(wrong, right) < 0.05  # what was carved or filled later has its own evidence
     assert moved(right, right, is_vessel=True) is None
+    assert moved(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)), right) == 0
     assert predicted(views).moved is None
 
 
