@@ -25,7 +25,7 @@ from polmvs.errors import DataError
 from polmvs.geometry import dots, lengths
 from polmvs.io.clouds import Cloud, read_cloud
 from polmvs.scene import PointKind
-from polmvs.surface.visual_hull import largest_plane
+from polmvs.surface.ground import largest_plane
 
 Array = NDArray[np.float64]
 

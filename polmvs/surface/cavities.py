@@ -38,6 +38,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS
 from polmvs.surface.borders import cells_beside
 from polmvs.surface.creases import CreaseTolerances
+from polmvs.surface.ground import SupportingPlane
 from polmvs.surface.mesh_geometry import MAX_CELLS, RayScene, TriangleMesh, height_field
 from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
@@ -55,7 +56,7 @@ from polmvs.surface.offsets import (
     snapped_border,
 )
 from polmvs.surface.surface_quality import SIGNIFICANCE
-from polmvs.surface.visual_hull import HullTolerances, SupportingPlane
+from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -36,6 +36,7 @@ from polmvs.surface.creases import (
 )
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
+from polmvs.surface.ground import SupportingPlane, supporting_plane
 from polmvs.surface.mesh_geometry import (
     Box,
     DistanceGrid,
@@ -96,9 +97,7 @@ from polmvs.surface.terms import KnownPoints, KnownSides
 from polmvs.surface.vessels import opened_hull
 from polmvs.surface.visual_hull import (
     HullTolerances,
-    SupportingPlane,
     VisualHull,
-    supporting_plane,
     visual_hull,
 )
 

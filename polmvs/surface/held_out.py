@@ -19,6 +19,7 @@ from polmvs.geometry import dots, points_on_rays
 from polmvs.polarization.kinds import Light
 from polmvs.scene import MIN_VIEWS
 from polmvs.surface.dense_view import lattice_xy
+from polmvs.surface.ground import SupportingPlane
 from polmvs.surface.mesh_geometry import RayScene, SignedDistance, TriangleMesh
 from polmvs.surface.observations import Image, Looking, level_image, rows_of_both
 from polmvs.surface.open_scene import OpenScene
@@ -26,7 +27,7 @@ from polmvs.surface.solver import Level, SolverTolerances, first_fit, refine
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints
 from polmvs.surface.vessels import opened_hull
-from polmvs.surface.visual_hull import SupportingPlane, VisualHull, visual_hull
+from polmvs.surface.visual_hull import VisualHull, visual_hull
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -35,10 +35,10 @@ from polmvs.polarization.phase_map import (
     smoothed_polarization,
 )
 from polmvs.scene import Tracks, View
+from polmvs.surface.ground import Ground, SupportingPlane, find_ground
 from polmvs.surface.matting import find_outline
 from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
 from polmvs.surface.vignetting import NUM_TERMS, fit_vignetting, vignetting_terms
-from polmvs.surface.visual_hull import SupportingPlane
 
 logger = logging.getLogger(__name__)
 
@@ -157,19 +157,21 @@ def find_object(
     plane has too little texture to find what hides it, or if its light moves.
     """
     points = tracks.points_in_world
-    near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
+    ground = find_ground(points, plane)
+    heights = np.abs(plane.height(points) - ground.height(points))
+    near = points[heights < 3 * np.median(heights)]
     # A plane without fine texture may have a coarse one.
-    shown = _shown_plane(maps, plane, near, 4, None)
+    shown = _shown_plane(maps, ground, near, 4, None)
     strengths = [cache(partial(dolp_in_sigmas, one)) for one in maps]
     features = [tracks.obs_xy[seen] for seen in tracks.of_views(len(maps))]
     for scale in (2, 1):
-        shown = _shown_plane(maps, plane, near, scale, shown)
-        small = _with_extent(shown.views, shown.textured, plane)
+        shown = _shown_plane(maps, ground, near, scale, shown)
+        small = _with_extent(shown.views, shown.textured, ground)
         shown = replace(shown, views=small)
         clues = [
             _Clues(*own) for own in zip(small, shown.shows_plane, strengths, features, strict=True)
         ]
-        bounded = _bounded(_space(small, plane), clues)
+        bounded = _bounded(_space(small, ground), clues)
         if bounded is None:
             return None
         coarse, num_cut = bounded
@@ -206,7 +208,7 @@ def find_object(
     # Threads, as sampling images releases Python's lock.
     found: list[FoundObject | None] = [None] * len(small)
     with ThreadPoolExecutor(default_num_workers()) as pool:
-        one = partial(_found, small, plane=plane, noise=noise)
+        one = partial(_found, small, ground=ground, noise=noise)
         chosen = ([values[index] for index in searched] for values in (masks, plates))
         for index, own in zip(searched, pool.map(one, searched, *chosen), strict=True):
             found[index] = own
@@ -233,13 +235,13 @@ class _Shown:
 
 def _shown_plane(
     maps: Sequence[PhaseMap],
-    plane: SupportingPlane,
+    ground: Ground,
     points: Floats,
     scale: float,
     coarser: _Shown | None,
 ) -> _Shown:
     """Where views show the texture of a plane with some points, at a scale of their images."""
-    views = [_working(phase_map, plane, TOL.working_px / scale) for phase_map in maps]
+    views = [_working(phase_map, ground, TOL.working_px / scale) for phase_map in maps]
     shares, expected = _showing_plane(views, points)
     # A window next to an outline on the plane contains the outline, also inside the object.
     size = 2 * round(0.5 * TOL.window_px + TOL.detail_px) - 1
@@ -326,7 +328,7 @@ class _Working:
         return distance * self.factor / self.view.camera.mean_focal_px
 
 
-def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> _Working:
+def _working(phase_map: PhaseMap, ground: Ground, longest_px: float) -> _Working:
     view, image = phase_map.view, np.asarray(phase_map.intensity, np.float32)
     factor = max(max(image.shape) / longest_px, 1.0)
     size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
@@ -337,7 +339,7 @@ def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> 
         cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
         for mask in (phase_map.region.inside, phase_map.region.bounded)
     )
-    on_plane = _on_plane(view, plane, pixel_centers(*size) * factor)
+    on_plane = ground.seen_at(view, pixel_centers(*size) * factor)
     has_plane = np.asarray(np.isfinite(on_plane).all(axis=-1), np.bool_)
     measured = np.asarray(phase_map.polarization)
     return _Working(
@@ -353,14 +355,6 @@ def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> 
         on_plane=on_plane,
         has_plane=has_plane,
     )
-
-
-def _on_plane(view: View, plane: SupportingPlane, xy: Floats) -> Array:
-    """Where the rays of image coordinates ``(..., 2)`` meet a plane; NaN where they do not."""
-    rays, center = view.rays_in_world(xy), view.center_in_world
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ranges = (plane.offset - center @ plane.normal) / (rays @ plane.normal)
-    return np.asarray(center + np.where(ranges > 0, ranges, np.nan)[..., None] * rays)
 
 
 def _views_to_search(
@@ -621,8 +615,9 @@ class _Cells:
         return np.asarray(cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, kernel) > 0)
 
 
-def _space(views: Sequence[_Working], plane: SupportingPlane) -> _Cells:
+def _space(views: Sequence[_Working], ground: Ground) -> _Cells:
     """Cells above the plane about the point where the cameras look, within the view of most."""
+    plane = ground.plane
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
         camera = view.view.camera
@@ -639,9 +634,8 @@ def _space(views: Sequence[_Working], plane: SupportingPlane) -> _Cells:
             ]
         )
     )
-    along = _along(plane)
     step = 2 * reach / TOL.num_cells
-    axes = step * np.stack([along, np.cross(plane.normal, along), plane.normal])
+    axes = step * np.vstack([plane.axes, plane.normal])
     shape = (TOL.num_cells, TOL.num_cells, max(round(0.75 * TOL.num_cells), 1))
     origin = foot - 0.5 * (TOL.num_cells - 1) * (axes[0] + axes[1]) + 0.5 * axes[2]
     return _Cells(origin, axes, np.ones(shape, bool))
@@ -771,11 +765,10 @@ def _without_vignetting(views: Sequence[_Working], shows_plane: Sequence[Mask]) 
 def _with_extent(
     views: Sequence[_Working],
     shows_plane: Sequence[Mask],
-    plane: SupportingPlane,
+    ground: Ground,
 ) -> list[_Working]:
     """Views that know how far the plane reaches: where two of them show it, and in between."""
-    along = _along(plane)
-    axes = np.stack([along, np.cross(plane.normal, along)], axis=1)
+    axes = ground.plane.axes.T
     shown = [view.on_plane[mask] @ axes for view, mask in zip(views, shows_plane, strict=True)]
     everything = np.concatenate(shown)
     if not len(everything):
@@ -811,12 +804,6 @@ def _cells_of(
         cells = np.floor((places - low) / step)
         inside = np.asarray(((cells >= 0) & (cells < counts)).all(axis=-1))
     return np.where(inside[..., None], cells, 0).astype(np.int64), inside
-
-
-def _along(plane: SupportingPlane) -> Array:
-    """A unit vector on a plane (3,)."""
-    along = np.cross(plane.normal, np.eye(3)[np.argmin(np.abs(plane.normal))])
-    return np.asarray(along / lengths(along))
 
 
 @dataclass(frozen=True)
@@ -1157,7 +1144,7 @@ def _found(
     mask: Mask,
     plate: _Plate,
     *,
-    plane: SupportingPlane,
+    ground: Ground,
     noise: float,
 ) -> FoundObject:
     """The object in a view's own pixels, with the sub-pixel position of its outline.
@@ -1167,7 +1154,7 @@ def _found(
     view = views[index]
     size = (view.view.camera.width, view.view.camera.height)
     coarse = cv2.resize(signed_distance_px(mask), size) * np.float32(view.factor)
-    behind = partial(_behind, views, index, plate, plane)
+    behind = partial(_behind, views, index, plate, ground)
     # Clipped light has no known polarization; 0 on both sides of an outline tells nothing.
     known = np.isfinite(view.measured[..., 2:3])
     intensity = view.without_vignetting
@@ -1186,7 +1173,7 @@ def _found(
 
 
 def _behind(
-    views: Sequence[_Working], index: int, plate: _Plate, plane: SupportingPlane, places: Floats
+    views: Sequence[_Working], index: int, plate: _Plate, ground: Ground, places: Floats
 ) -> tuple[Image, Image, Mask]:
     """The plane at image coordinates ``(..., 2)`` of a view, predicted from others.
 
@@ -1196,7 +1183,7 @@ def _behind(
     plane.
     """
     view = views[index]
-    on_plane = _on_plane(view.view, plane, places)
+    on_plane = ground.seen_at(view.view, places)
     xy = places / view.factor
     has_plane = _marked(view.has_plane, xy)
     shown = []

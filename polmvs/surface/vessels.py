@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from polmvs.geometry import points_on_rays
 from polmvs.surface.cavities import Cavity, find_vessel
+from polmvs.surface.ground import SupportingPlane
 from polmvs.surface.mesh_geometry import DistanceGrid, RayScene, SignedDistance
 from polmvs.surface.solver import (
     REMESHING_LOSS,
@@ -26,7 +27,7 @@ from polmvs.surface.solver import (
 )
 from polmvs.surface.surface_quality import view_information
 from polmvs.surface.surface_view import SurfaceView
-from polmvs.surface.visual_hull import SupportingPlane, VisualHull
+from polmvs.surface.visual_hull import VisualHull
 
 Array = NDArray[np.float64]
 

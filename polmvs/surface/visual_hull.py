@@ -1,8 +1,8 @@
 """The visual hull of silhouettes, robust against some wrong views.
 
 The value of a point is the k-th largest of its signed distances to the views' silhouettes (pixels
-times the GSD there), so k - 1 views may deny it wrongly. The sparse points of the surroundings show
-the plane on which the objects stand; space behind it is outside.
+times the GSD there), so k - 1 views may deny it wrongly. Space below the plane on which the objects
+stand is outside.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from polmvs.camera import sample_image
+from polmvs.surface.ground import SupportingPlane
 from polmvs.surface.mesh_geometry import (
     MAX_CELLS,
     SignedDistance,
@@ -43,115 +44,17 @@ class HullTolerances:
         supporting plane, where no view sees it, the hull extends by three default spacings: two
         edges of that mesh. Measured: a plate on the demo's table vanishes without this extension,
         and with half of it a thin bowl loses 0.3 points of F at 1 mm.
-    min_seen_share : of the views that must have a point in their image. Measured with the two
-        tolerances of the plane on an analytic vase: both factors of two within 0.01 points of F at
-        1 mm.
+    min_seen_share : of the views that must have a point in their image. Measured on an analytic
+        vase: both factors of two within 0.01 points of F at 1 mm.
     min_piece_share : of the largest piece's volume; smaller pieces are removed. Guess.
-    plane_distance : of inliers to the supporting plane, as a share of the cameras' distance.
-        Measured, 0.005: Chamfer of an analytic torus 0.31 -> 0.34 mm.
-    min_plane_share : of the sparse points of the surroundings that lie in a supporting plane.
     """
 
     step_px: float = 4.0
     min_seen_share: float = 0.34
     min_piece_share: float = 0.01
-    plane_distance: float = 0.004
-    min_plane_share: float = 0.25
 
 
 TOL = HullTolerances()
-
-
-@dataclass(frozen=True)
-class SupportingPlane:
-    """Points x with ``normal . x = offset``; free space has ``normal . x > offset``."""
-
-    normal: Array
-    offset: float
-
-    def height(self, points: Floats) -> Array:
-        """Signed distance ``(N,)`` of points ``(N, 3)``."""
-        return np.asarray(points @ self.normal - self.offset)
-
-
-def supporting_plane(
-    surroundings: Floats,
-    centers: Array,
-    *,
-    num_trials: int = 400,
-    seed: int = 0,
-) -> SupportingPlane | None:
-    """The plane on which the objects stand, if the points around them show one.
-
-    Parameters
-    ----------
-    surroundings : (N, 3), sparse points beside the objects.
-    centers : (C, 3), of the cameras; they lie on the free side.
-    num_trials : random triples of points.
-    seed : of the random numbers.
-
-    Returns
-    -------
-    None if fewer than ``min_plane_share`` of the points lie in one plane, or cameras are on both
-    sides.
-    """
-    num = len(surroundings)
-    if num < 20:
-        return None
-    middle = np.median(surroundings, axis=0)
-    limit = TOL.plane_distance * float(np.median(np.linalg.norm(centers - middle, axis=1)))
-    found = largest_plane(surroundings, limit, num_trials=num_trials, seed=seed)
-    if found is None:
-        return None
-    normal, offset, inliers = found
-    heights = centers @ normal - offset
-    if np.median(heights) < 0:
-        normal, offset, heights = -normal, -offset, -heights
-    if inliers.sum() < TOL.min_plane_share * num or heights.min() < 0:
-        return None
-    return SupportingPlane(normal, offset)
-
-
-def largest_plane(
-    points: Floats, limit: float, *, num_trials: int = 400, seed: int = 0
-) -> tuple[Array, float, Mask] | None:
-    """The plane ``normal . x = offset`` with the most points: RANSAC, then least squares.
-
-    Parameters
-    ----------
-    points : (N, 3)
-    limit : distance of inliers.
-    num_trials : random triples of points.
-    seed : of the random numbers.
-
-    Returns
-    -------
-    Unit normal (3,), offset and inliers (N,); None if there is no plane.
-    """
-    num = len(points)
-    if num < 3:
-        return None
-    rng = np.random.default_rng(seed)
-    picks = rng.integers(0, num, (num_trials, 3))
-    a, b, c = (points[picks[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    length = np.linalg.norm(normals, axis=1)
-    usable = length > 1e-12
-    if not usable.any():
-        return None
-    normals, a = normals[usable] / length[usable, None], a[usable]
-    tested = points[rng.permutation(num)[:2000]]
-    distances = np.abs(tested @ normals.T - (a * normals).sum(axis=1))
-    best = int((distances < limit).sum(axis=0).argmax())
-    normal, offset = normals[best], float(a[best] @ normals[best])
-    for _ in range(3):
-        inside = np.abs(points @ normal - offset) < limit
-        if inside.sum() < 3:
-            return None
-        center = points[inside].mean(axis=0)
-        normal = np.linalg.svd(points[inside] - center, full_matrices=False)[2][2]
-        offset = float(center @ normal)
-    return normal, offset, inside
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,13 @@ from scipy.spatial import ConvexHull
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.polarization.kinds import AngleModel
 from polmvs.surface.cavities import find_vessel
+from polmvs.surface.ground import SupportingPlane
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import Looking
 from polmvs.surface.solver import first_fit
 from polmvs.surface.surface_view import Silhouette, surface_view
 from polmvs.surface.vessels import opened_hull, rim_height
-from polmvs.surface.visual_hull import SupportingPlane, visual_hull
+from polmvs.surface.visual_hull import visual_hull
 
 WALL = 0.16
 GROUND = SupportingPlane(np.array([0.0, 0.0, 1.0]), -1.0)

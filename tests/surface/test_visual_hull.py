@@ -13,11 +13,10 @@ from analytic_objects import (
 )
 
 from polmvs.surface.global_surface import consistent_hull
+from polmvs.surface.ground import SupportingPlane
 from polmvs.surface.surface_view import Silhouette, surface_view
 from polmvs.surface.visual_hull import (
     HullTolerances,
-    SupportingPlane,
-    supporting_plane,
     visual_hull,
 )
 
@@ -114,29 +113,3 @@ def test_no_common_object_is_an_empty_hull(ball):
     corner[:5, :5] = True
     scattered = [replace(v, silhouette=Silhouette(corner, corner)) for v in ball]
     assert len(visual_hull(scattered, wrong_share=0.0).mesh.faces) == 0
-
-
-def plane_scene(rng, share):
-    on = rng.uniform(-2, 2, (300, 3)) * [1, 1, 0] + [0, 0, -1]
-    off = rng.uniform(-2, 2, (round(300 / share) - 300, 3)) + np.array([0, 0, 2.5])
-    return np.concatenate([on + 0.002 * rng.standard_normal(on.shape), off])
-
-
-def test_the_plane_of_the_surroundings_is_found_among_other_points():
-    rng = np.random.default_rng(0)
-    centers = np.array([view.center_in_world for view in ring_of_views()])
-    plane = supporting_plane(plane_scene(rng, 0.5), centers)
-    assert plane is not None
-    assert plane.normal @ [0, 0, 1.0] > 0.9999
-    assert plane.height(np.array([[0, 0, -1.0]])) == pytest.approx(0, abs=2e-3)
-    assert plane.height(centers).min() > 0
-
-
-def test_no_plane_without_support():
-    rng = np.random.default_rng(0)
-    centers = np.array([view.center_in_world for view in ring_of_views()])
-    assert supporting_plane(rng.uniform(-2, 2, (400, 3)), centers) is None
-    assert supporting_plane(np.zeros((3, 3)), centers) is None
-    below = centers * [1, 1, -1]
-    mixed = np.concatenate([centers[:5], below[5:]])
-    assert supporting_plane(plane_scene(rng, 0.9), mixed) is None

@@ -44,8 +44,8 @@ from polmvs.polarization.phase_map import (
 )
 from polmvs.polarization.region import find_region
 from polmvs.scene import MIN_VIEWS, Tracks, View, evenly_spread
+from polmvs.surface.ground import supporting_plane
 from polmvs.surface.object_search import FoundObject, find_object
-from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 

@@ -27,6 +27,7 @@ from polmvs.pipeline.stages.silhouettes import open_surface_views
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind, evenly_spread
+from polmvs.surface.ground import supporting_plane
 from polmvs.surface.held_out import HeldOutTolerances, WholeSurface, predict, predict_left_out
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import (
@@ -42,7 +43,6 @@ from polmvs.surface.soundness import find_soundness
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.surroundings import sparse_surroundings
 from polmvs.surface.terms import KnownPoints, TermTolerances
-from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
