@@ -167,6 +167,13 @@ class SceneryOptions(OptionGroup, group="scenery"):
         above=0,
         most=1,
     )
+    relief: float = option(
+        0.0,
+        "root mean square height of the table's waves, as of a cloth, as a share of the object's "
+        "size; under the object it is flat",
+        least=0,
+        most=0.1,
+    )
     turntable: bool = option(
         False, "object and surroundings turn, light, background and camera stand still"
     )

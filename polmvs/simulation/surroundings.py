@@ -29,6 +29,9 @@ NUM_BLOCKS = 9
 BLOCK_RING = (0.78, 1.3)
 PRINT_SIDE = 2048  # texels of the table's print: 2.4 mm of an object of a metre
 BLOCK_PRINT_SIDE = 256
+NUM_WAVES = 24
+WAVE_LENGTHS = (0.4, 1.2)
+WAVES_RISE = 0.3
 BOARD_MARKERS = 15  # along each side; 225 of the 250 of the dictionary
 BOARD_TEXELS = 2250
 MARKER_SHARE = 0.72  # of a cell: 108 of 150 texels
@@ -65,10 +68,66 @@ def surroundings(
     if options.surroundings is Scenery.NOTHING:
         return []
     rng = np.random.default_rng(seed)
+    waves = _Waves.random(options.relief * size, size, radius, seed)
+    table = waves.lifted(_table(size, rng, round_=options.turntable))
     if options.surroundings is Scenery.BOARD:
-        table = _table(size, rng, round_=options.turntable)
         return [replace(table, print=_marker_board())]
-    return [_table(size, rng, round_=options.turntable), *_blocks(size, radius, rng, options)]
+    return [table, *_blocks(size, radius, rng, options, waves)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Waves:
+    """Relief of the table: plane waves of random directions, flat under the object.
+
+    Attributes
+    ----------
+    numbers : (N, 2), angular wave numbers, rad per metre.
+    phases : (N,), rad.
+    amplitude : of each, metres.
+    flat, full : distances from the origin up to which the table is flat, and from which the waves
+        have their full height, metres.
+    """
+
+    numbers: Array
+    phases: Array
+    amplitude: float
+    flat: float
+    full: float
+
+    @staticmethod
+    def random(relief: float, size: float, radius: float, seed: int) -> _Waves:
+        """Waves with a root mean square height."""
+        rng = np.random.default_rng((seed, 1))  # the prints of a seed are the same with relief
+        azimuth, phases = rng.uniform(0, 2 * np.pi, (2, NUM_WAVES))
+        length = size * rng.uniform(*WAVE_LENGTHS, NUM_WAVES)
+        directions = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+        return _Waves(
+            numbers=2 * np.pi / length[:, None] * directions,
+            phases=phases,
+            amplitude=relief * math.sqrt(2 / NUM_WAVES),
+            flat=radius,
+            full=radius + WAVES_RISE * size,
+        )
+
+    def heights(self, places: Array) -> Array:
+        """Heights ``(...)`` at places ``(..., 2)``."""
+        share = (np.linalg.norm(places, axis=-1) - self.flat) / (self.full - self.flat)
+        share = np.clip(share, 0, 1)
+        waves = np.cos(places @ self.numbers.T + self.phases).sum(axis=-1)
+        return np.asarray(self.amplitude * share**2 * (3 - 2 * share) * waves)
+
+    def lifted(self, flat: Surrounding) -> Surrounding:
+        """A flat table with these waves."""
+        if self.amplitude == 0:
+            return flat
+        places, step = flat.mesh.vertices[:, :2], 1e-3 * self.full
+        slopes = [
+            (self.heights(places + along) - self.heights(places - along)) / (2 * step)
+            for along in step * np.eye(2)
+        ]
+        vertices = np.column_stack([places, self.heights(places)])
+        normals = unit(np.column_stack([-slopes[0], -slopes[1], np.ones(len(places))]))
+        return replace(flat, mesh=Mesh(vertices, normals, flat.mesh.triangles))
 
 
 def _marker_board() -> Image:
@@ -120,7 +179,11 @@ def _table(size: float, rng: np.random.Generator, *, round_: bool) -> Surroundin
 
 
 def _blocks(
-    size: float, radius: float, rng: np.random.Generator, options: SceneryOptions
+    size: float,
+    radius: float,
+    rng: np.random.Generator,
+    options: SceneryOptions,
+    waves: _Waves,
 ) -> list[Surrounding]:
     """Printed boxes in a ring about the object, which they do not touch."""
     found = []
@@ -133,7 +196,8 @@ def _blocks(
         if options.turntable:
             high = TURNTABLE_RADIUS - 0.2
         away = max(nearest + 0.05 * size, size * rng.uniform(low, high))
-        center = away * np.array([math.cos(azimuth), math.sin(azimuth)])
+        place = away * np.array([math.cos(azimuth), math.sin(azimuth)])
+        center = np.append(place, waves.heights(place))
         found.append(
             _block(sides, turn, center, _print(BLOCK_PRINT_SIDE, int(rng.integers(1 << 31))))
         )
@@ -166,7 +230,7 @@ def _block(sides: Array, turn: float, center: Array, texture: Image) -> Surround
     ):
         local = (grid @ np.array([first, second]) + outwards) * half
         start = len(points) * len(grid)
-        points.append(local @ rotation.T + [*center, half[2]])
+        points.append(local @ rotation.T + center + [0, 0, half[2]])
         normals.append(np.broadcast_to(rotation @ np.array(outwards, np.float64), local.shape))
         extent = np.array([np.abs(first) @ sides, np.abs(second) @ sides]) / longest / 3
         corner = np.array([face % 3, face // 3]) / 3

@@ -82,7 +82,8 @@ def opened_hull(
 
     # Outlines on the ground are uncertain, so the hull reaches below the plane; the floor does not.
     above = carved(lambda points: -plane.height(points))
-    cavity = find_vessel(above, top, fit.gsd, gain)
+    known = np.zeros((0, 3)) if fit.known is None else fit.known.points
+    cavity = find_vessel(above, top, fit.gsd, gain, known)
     if cavity is None:
         return hull, None
     vessel = hull.carved([cavity.values])

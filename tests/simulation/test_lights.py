@@ -44,3 +44,24 @@ def test_board_bears_markers_that_are_found_and_a_turntable_is_round():
     table = surroundings(SceneryOptions(turntable=True), 0.2, 0.1, 0)
     reach = max(np.linalg.norm(one.mesh.vertices[:, :2], axis=1).max() for one in table)
     assert reach <= TURNTABLE_RADIUS * 0.2 * 1.15
+
+
+def test_a_crumpled_table_is_flat_under_the_object_and_has_its_prints():
+    flat, crumpled = (
+        surroundings(SceneryOptions(relief=relief), 0.2, 0.1, 7) for relief in (0.0, 0.02)
+    )
+    np.testing.assert_array_equal(flat[0].print, crumpled[0].print)
+    places, heights = np.split(crumpled[0].mesh.vertices, [2], axis=1)
+    away = np.linalg.norm(places, axis=1)
+    assert (flat[0].mesh.vertices[:, 2] == 0).all()
+    assert (heights[away <= 0.1] == 0).all()
+    # 24 waves over some wavelengths: their mean square varies by about a third.
+    assert np.sqrt(np.mean(heights[away > 0.16] ** 2)) == pytest.approx(0.004, rel=0.3)
+    edges = np.diff(crumpled[0].mesh.vertices[crumpled[0].mesh.triangles[:, :2]], axis=1)[:, 0]
+    normals = crumpled[0].mesh.normals[crumpled[0].mesh.triangles[:, :2]].mean(axis=1)
+    rise = np.abs((edges * normals).sum(axis=1)) / np.linalg.norm(edges, axis=1)
+    assert np.quantile(rise, 0.95) < 0.02  # of flat normals 0.2
+    for one, other in zip(flat[1:], crumpled[1:], strict=True):
+        moved = other.mesh.vertices - one.mesh.vertices
+        np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-12)
+        assert (moved[:, :2] == 0).all()

@@ -32,6 +32,7 @@ def bowl(points):
     return np.maximum(half_ball(points), 1 - WALL - np.linalg.norm(points, axis=-1))
 
 
+NO_POINTS = np.zeros((0, 3))
 BOTTOM = 0.45  # thickness of the bottom of a bowl whose wall is WALL thick
 
 
@@ -142,6 +143,26 @@ def test_the_bottom_is_as_thick_as_phases_show(solid, bottom):
     assert depth_on_axis(carved.distances) == pytest.approx(1 - bottom, abs=2 * hull.step)
 
 
+@pytest.mark.parametrize(("num", "bottom"), [(60, BOTTOM), (9, WALL)])
+def test_points_inside_tell_the_depth_that_phases_miss(of_bowl, num, bottom):
+    """Phases prefer a bottom as thick as the wall. A sixth of the points are mirror images."""
+    hull, _ = of_bowl
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(num, 3)) * [1, 1, -2]
+    directions[:, 2] = -np.abs(directions[:, 2])
+    radii = np.array([1 - WALL, 1 - WALL, 1 - BOTTOM])
+    points = directions / np.linalg.norm(directions / radii, axis=1, keepdims=True)
+    points[: num // 6] = rng.uniform(-0.3, 0.3, (num // 6, 3))
+
+    def gain(cavity):
+        return np.full(8, 1 - 10 * np.log(cavity.thickness / WALL) ** 2 + cavity.depth)
+
+    top = replace(GROUND, offset=GROUND.offset + 1.0)
+    vessel = find_vessel(RayScene(hull.mesh), top, hull.gsd, gain, points)
+    assert vessel is not None
+    assert vessel.depth == pytest.approx(1 - bottom, abs=2 * hull.step)
+
+
 @pytest.mark.parametrize("solid", [half_ball, drum, beaker])
 def test_a_lid_and_a_deep_vessel_keep_their_hull(solid):
     hull, fit = given(solid)
@@ -160,7 +181,7 @@ def test_a_vessel_is_carved_into_a_rough_hull_only_if_views_agree(of_bowl, gains
         return np.array(gains) * (1 - np.log(cavity.thickness / WALL) ** 2)
 
     top = replace(GROUND, offset=GROUND.offset + 1.0)
-    vessel = find_vessel(RayScene(hull.mesh), top, hull.gsd, gain)
+    vessel = find_vessel(RayScene(hull.mesh), top, hull.gsd, gain, NO_POINTS)
     assert (vessel is not None) == is_open
 
 
@@ -178,4 +199,4 @@ def test_a_plane_below_the_whole_hull_is_the_rim_of_no_vessel(of_bowl):
 
     for below in (0.25, 1.0):  # its bottom is near the plane; the plane is far below
         top = replace(GROUND, offset=float(lowest - below * hull.gsd))
-        assert find_vessel(RayScene(hull.mesh), top, hull.gsd, gain) is None
+        assert find_vessel(RayScene(hull.mesh), top, hull.gsd, gain, NO_POINTS) is None
