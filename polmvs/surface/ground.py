@@ -34,6 +34,10 @@ NUM_STEPS = 5  # along a ray: each leaves a share of the error, the ground's slo
 class GroundTolerances:
     """Tolerances of the ground.
 
+    Those of the relief were measured on six uneven grounds, by the deviation of points that it is
+    not fitted to (0.12 to 0.82 px; from the plane 2.3 to 5.2). Half and twice of most change it by
+    at most 0.12 px, half of ``relief`` by up to 0.8, coarser windows or grids by up to 0.7.
+
     Attributes
     ----------
     distance : of inliers to the supporting plane, as a share of the cameras' distance. Measured,
@@ -44,7 +48,7 @@ class GroundTolerances:
     relief : largest height of the relief, in the distances of the plane's inliers.
     num_cells : of the relief's grid, along its side.
     widest : deviation of the widest window, sides of the grid.
-    narrowest : deviation of the narrowest window, cells: below it the grid rounds its shape.
+    narrowest : deviation of the narrowest window, cells: below it the grid distorts the window.
     narrowing : ratio of the deviations of one window and the next.
     num_rounds : of robust weights in each window.
     prior_points : number of points of height 0 that are added to a window.
@@ -56,7 +60,7 @@ class GroundTolerances:
     relief: float = 4.0
     num_cells: int = 128
     widest: float = 0.25
-    narrowest: float = 1.5
+    narrowest: float = 1.0
     narrowing: float = 1.5
     num_rounds: int = 3
     prior_points: float = 4.0
