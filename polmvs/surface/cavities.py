@@ -323,7 +323,7 @@ def find_vessel(
     """The shallow cavity below a plane, at whose walls the phases are likelier than on a solid.
 
     Known points inside tell its depth. Without them phases do, which light that was reflected
-    several times biases: in a bowl without gloss by a quarter of the depth.
+    several times biases: in a glazed bowl by a fifth of the depth.
 
     Parameters
     ----------
