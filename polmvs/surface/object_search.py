@@ -3,11 +3,11 @@
 Polarization does not show the outline of grey and white objects. The ground on which they stand
 does, if it has a texture: its image in one view is predicted from the others. It is a plane with
 relief (:mod:`polmvs.surface.ground`), called the plane here. Pixels that agree with the prediction
-show the plane, so the space between it and the camera is free. Where there is
-no prediction, brightness and contrast decide. The remaining space above the plane is the object
-where the cameras look, with others beside it that are polarized and as poor in features as it.
-The outline in each view is where the image changes from the predicted plane to the brightness of
-the object, as in matting against a known background.
+show the plane, so the space between it and the camera is free. Where there is no prediction,
+brightness and contrast decide. The remaining space above the plane is the object where the cameras
+look, with others beside it that are polarized and as poor in features as it. The outline in each
+view is where the image changes from the predicted plane to the brightness of the object, as in
+matting against a known background.
 """
 
 from __future__ import annotations
