@@ -65,8 +65,6 @@ _scratch = threading.local()
 
 DISPLAY_GAMMA = 2.2
 WHITE_PERCENTILE = 99.5
-MOST_PERCENTILE = 90  # of what is never white, as the object may be all that is bright. Guess
-MIDDLE_GRAY = 0.18  # of white: the usual exposure of a photograph
 WHITE_IMAGES = 32  # images from which the white level is taken, evenly spread over the capture
 WHITE_SAMPLES = 20_000  # cells of each
 # That are looked at for lossy compression, the pattern and the gamma, evenly spread. Fewer do not
@@ -245,11 +243,9 @@ class Capture:
         return self._linear(self._view(name).files[0])[0]
 
     def exposure(self) -> float:
-        """White level of s0 for the whole capture, units of full scale.
+        """White level of s0 for the whole capture, units of full scale: its 99.5 percentile.
 
-        It is the 99.5th percentile of at most 32 images, evenly spread, and 20,000 cells of each.
-        If highlights or windows leave the rest dark, it is lower: the median is then middle gray,
-        or a tenth of the cells is white.
+        It is taken from at most 32 images, evenly spread, and 20,000 cells of each.
 
         Raises
         ------
@@ -259,10 +255,7 @@ class Capture:
         views = self.files.views
         step = -(-len(views) // WHITE_IMAGES)
         samples = [self._intensity_samples(view) for view in views[::step]]
-        median, most, brightest = np.percentile(
-            np.concatenate(samples), (50, MOST_PERCENTILE, WHITE_PERCENTILE)
-        )
-        white = float(min(max(median / MIDDLE_GRAY, most), brightest))
+        white = float(np.percentile(np.concatenate(samples), WHITE_PERCENTILE))
         if not white > 0:
             raise DataError(self.folder, "the images are black. Check exposure and lens cap.")
         return white

@@ -51,6 +51,23 @@ def pose_errors(model: SparseModel) -> tuple[np.ndarray, np.ndarray]:
     return 1e3 * distances, np.degrees(np.linalg.norm(np.array(turns)[..., 0], axis=1))
 
 
+def test_images_of_low_contrast_give_as_many_points(images, tmp_path, caplog):
+    """As if a window left the rest dark."""
+    caplog.set_level("INFO")
+    dark = tmp_path / "dark"
+    dark.mkdir()
+    for path in images.iterdir():
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(dark / path.name), np.rint(50 + 0.2 * image).astype(np.uint8))
+    model = reconstruct(dark, tmp_path, intrinsics=INTRINSICS)
+    assert "lower contrast" in caplog.text
+    assert len(model.views) == 10
+    assert len(model.tracks.point3D_ids) > 700
+    centers, rotations = pose_errors(model)
+    assert centers.max() < 3
+    assert rotations.max() < 0.3
+
+
 def test_demo_with_intrinsics(images, tmp_path):
     stages: list[str] = []
     names = sorted(path.name for path in images.iterdir())
