@@ -102,10 +102,10 @@ class SfmTolerances:
     max_images_two_view_tracks : number of images up to which tracks of two views are used; a guess:
         with few images most tracks have only two views, with more those are mostly mismatches.
     few_features, low_contrast : median number of SIFT features of an image below which those of a
-        lower contrast are described too, and that contrast, as a share of the image's range.
-        Measured: in an image that a highlight leaves dark, COLMAP's least contrast, 0.0067, finds
-        750 features, 0.002 8,400. In well exposed images these are 1 to 40 % more, and some are of
-        noise.
+        lower contrast are described too (guess), and that contrast, as a share of the image's
+        range. Measured: in an image that a highlight leaves dark, COLMAP's least contrast, 0.0067,
+        finds 750 features, 0.002 8,400. In well exposed images these are 1 to 40 % more, and some
+        are of noise.
     focal_range : plausible focal lengths, in widths of the image: 136 to 6 degrees.
     """
 
@@ -119,7 +119,7 @@ class SfmTolerances:
     min_pair_matches: int = COLMAP_DEFAULTS.init_min_num_inliers
     max_images_dense: int = 400
     max_images_two_view_tracks: int = 5
-    few_features: int = 1000
+    few_features: int = 1500
     low_contrast: float = 0.002
     focal_range: tuple[float, float] = (0.2, 10.0)
 
@@ -469,6 +469,7 @@ def triangulate_views(
         database=_place_of_database(work_folder),
         reader=reader,
         options=options,
+        tolerances=SfmTolerances(few_features=0),  # known poses do not hang on them
     )
     pycolmap.set_random_seed(options.seed)
     with quiet_colmap():
