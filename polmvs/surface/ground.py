@@ -114,21 +114,27 @@ def supporting_plane(
 
     Returns
     -------
-    None if fewer than ``min_share`` of the points lie in one plane, or cameras are on both sides.
+    None if fewer than ``min_share`` of the points lie in one plane, if more lie below it, or if
+    cameras are on both sides.
     """
     num = len(surroundings)
     if num < 20:
         return None
     middle = np.median(surroundings, axis=0)
     limit = TOL.distance * float(np.median(lengths(centers - middle)))
-    last = TOL.max_factor * limit
+    last, above = TOL.max_factor * limit, None
     while limit <= last:
-        found = largest_plane(surroundings, limit, above=centers, num_trials=num_trials, seed=seed)
+        found = largest_plane(surroundings, limit, above=above, num_trials=num_trials, seed=seed)
         if found is not None:
             normal, offset, inliers = found
-            if inliers.sum() >= TOL.min_share * num and (centers @ normal > offset).all():
+            if np.median(centers @ normal) < offset:
+                normal, offset = -normal, -offset
+            # The tops of blocks may have more points in one plane than uneven ground below them.
+            num_below = np.count_nonzero(surroundings @ normal < offset - limit)
+            enough = inliers.sum() >= max(TOL.min_share * num, num_below)
+            if enough and (centers @ normal > offset).all():
                 return SupportingPlane(normal, offset, limit)
-        limit *= 2
+        limit, above = 2 * limit, centers
     return None
 
 
@@ -152,7 +158,7 @@ def largest_plane(
 
     Returns
     -------
-    Unit normal (3,), upwards, offset and inliers (N,); None if there is no plane.
+    Unit normal (3,), offset and inliers (N,); None if there is no plane.
     """
     num = len(points)
     if num < 3:
@@ -182,8 +188,6 @@ def largest_plane(
         center = points[inside].mean(axis=0)
         normal = np.linalg.svd(points[inside] - center, full_matrices=False)[2][2]
         offset = float(center @ normal)
-    if above is not None and np.median(above @ normal) < offset:
-        normal, offset = -normal, -offset
     return normal, offset, inside
 
 
