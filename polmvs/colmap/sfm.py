@@ -469,7 +469,7 @@ def triangulate_views(
         database=_place_of_database(work_folder),
         reader=reader,
         options=options,
-        tolerances=SfmTolerances(few_features=0),  # known poses do not hang on them
+        tolerances=SfmTolerances(few_features=0),  # known poses need no more features
     )
     pycolmap.set_random_seed(options.seed)
     with quiet_colmap():

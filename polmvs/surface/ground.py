@@ -1,9 +1,9 @@
 """The ground on which the objects stand: a plane with relief, from sparse points.
 
 A table is a plane; a cloth, a lawn or a pile of paper is not. The relief is a field of heights over
-the plane, from the heights of the sparse points: robust means in a Gaussian window that narrows as
-long as half of the points predict the other half better (cross-validation, Stone 1974). Where no
-width does, the relief is 0 and the ground is the plane.
+the plane, from the heights of the sparse points: robust means in Gaussian windows, from wide to
+narrow, down to the width at which half of the points predict the other half best (cross-validation,
+Stone 1974). If no width predicts them better than the plane, the relief is 0.
 """
 
 from __future__ import annotations
@@ -233,11 +233,13 @@ class Ground:
         rays, center = view.rays_in_world(xy), view.center_in_world
         down = rays @ self.plane.normal
         height, places = np.zeros(rays.shape[:-1]), rays
-        for _ in range(1 if self.is_flat else NUM_STEPS):
+        for _ in range(NUM_STEPS):
             with np.errstate(divide="ignore", invalid="ignore"):
                 ranges = (height - self.plane.height(center)) / down
             places = center + np.where(ranges > 0, ranges, np.nan)[..., None] * rays
-            height = height if self.is_flat else self.height(places)
+            if self.is_flat:
+                break
+            height = self.height(places)
         return np.asarray(places)
 
 
