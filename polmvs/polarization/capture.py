@@ -32,13 +32,20 @@ from polmvs.io.raw_formats import (
     probe_raw,
     read_raw,
 )
-from polmvs.polarization.angle_gains import AngleGains, find_angle_gains
+from polmvs.polarization.angle_gains import (
+    AngleGains,
+    CaptureGains,
+    ChannelGains,
+    capture_gains,
+    find_angle_gains,
+)
 from polmvs.polarization.bit_depth import CONTAINER_BITS, LevelCounts, Levels, decide_levels
 from polmvs.polarization.calibration import PolarizerCalibration, read_calibration
 from polmvs.polarization.exposures import merge_exposures
 from polmvs.polarization.linearity import LinearityCheck, check_linearity
 from polmvs.polarization.lossy import BLOCK, find_quantization, lossy_mean_variance, lossy_variance
 from polmvs.polarization.mosaic import (
+    ANGLES_DEG,
     clipped_cells,
     linearize,
     noise_area_px,
@@ -71,6 +78,7 @@ WHITE_SAMPLES = 20_000  # cells of each
 # tell the gamma: in one image the scene's own change of polarization passes for one, found 0.46 to
 # 1.29 in single linear images of the shared captures, 1.00 to 1.03 in whole captures.
 CHECKED_IMAGES = 3
+GAIN_VIEWS = 8  # whose gains are looked at, evenly spread: a median and a spread of them
 MOST_PIXELS, MAX_DOLP = 0.9, 1.5  # a map of which a tenth exceeds this holds something else
 # A camera that records 16 bits hardly needs 1/65536 to tell its levels apart; floats say nothing.
 FLOAT_QUANTUM = 2.0**-CONTAINER_BITS
@@ -94,6 +102,7 @@ class Capture:
     orientations : TIFF orientations that occur; the samples are as stored.
     pattern_check, linearity_check : of a monochrome mosaic's pattern and gamma; None for others.
     angle_gains : of the checked views of an ``ANGLES`` capture; empty for others.
+    gains : of the polarizer angles, for each colour of a mosaic; empty if they are not known.
     """
 
     folder: Path
@@ -109,6 +118,7 @@ class Capture:
     pattern_check: PatternCheck | None = None
     linearity_check: LinearityCheck | None = None
     angle_gains: tuple[AngleGains, ...] = ()
+    gains: tuple[CaptureGains, ...] = ()
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -160,6 +170,7 @@ class Capture:
             lines.append(self.pattern_check.message)
         if self.linearity_check is not None and self.linearity_check.fits is not False:
             lines.append(self.linearity_check.message)
+        lines.extend({gains.message: None for gains in self.gains if gains.message is not None})
         return tuple(lines)
 
     @property
@@ -291,6 +302,13 @@ class Capture:
         return merged, nowhere.astype(np.uint8), 1.0
 
     def _from_mosaic(self, view: ViewFiles) -> Stokes:
+        colours, clipped = self._split(view)
+        return self._one_colour(
+            [self._stokes(images, clipped, index) for index, images in enumerate(colours)]
+        )
+
+    def _split(self, view: ViewFiles) -> tuple[list[Image], Mask]:
+        """Four angle images (4, H, W) of each colour of a mosaic, and where one is clipped."""
         options = self.options
         if self._is_plain and len(view.paths) == 1:
             samples = self._read(view.paths[0])
@@ -300,24 +318,30 @@ class Capture:
                 scale=1.0 / self.full_scale,
                 out=_angle_images(self.height, self.width),
             )
-            return self._stokes(images, clipped_cells(samples, self._threshold))
+            return [images], clipped_cells(samples, self._threshold)
         linear, raw, threshold = self._linear(view.files[0])
         full = options.resolution is Resolution.FULL
         clipped = clipped_cells(raw, threshold, colour=options.bayer is not None, full=full)
         if options.bayer is not None:
             colours = split_colour_mosaic(linear, options.pattern, options.bayer, full=full)
-            return self._one_colour(
-                [self._stokes(colour, clipped, index) for index, colour in enumerate(colours)]
-            )
+            return list(colours), clipped
         split = split_mosaic_full if full else split_mosaic
-        return self._stokes(split(linear, options.pattern), clipped)
+        return [split(linear, options.pattern)], clipped
 
-    def _stokes(self, images: Image, clipped: Mask, colour: int | None = None) -> Stokes:
+    def _stokes(self, images: Image, clipped: Mask, colour: int) -> Stokes:
         """Stokes images of a mosaic's four angle images, of one colour or of a monochrome one."""
         darkness, quantum, lossy = self.options.darkness, self._quantum, self._lossy_variance
         if self.calibration is None:
+            gains = self.gains[colour].common if self.gains else None
+            if gains is not None:
+                images /= np.array(gains.gains, np.float32)[:, None, None]
             return stokes_from_intensities(
-                images, clipped, darkness=darkness, quantum=quantum, lossy_variance=lossy
+                images,
+                clipped,
+                darkness=darkness,
+                quantum=quantum,
+                lossy_variance=lossy,
+                gain_sigma=None if gains is None else gains.sigma,
             )
         shape = (self.header.height, self.header.width)
         full = self.options.resolution is Resolution.FULL
@@ -325,13 +349,13 @@ class Capture:
         try:
             return stokes_by_least_squares(
                 images,
-                analyzers if colour is None else analyzers[colour],
+                analyzers if self.options.bayer is None else analyzers[colour],
                 clipped,
                 darkness=darkness,
                 quantum=quantum,
                 interpolated=True,
                 lossy_variance=lossy,
-                gains_known=True,
+                gain_sigma=0.0,
             )
         except ValueError as error:
             file = self.options.calibration
@@ -348,26 +372,40 @@ class Capture:
         stack, spoiled = np.stack(linear), np.logical_or.reduce(clipped)
         return stack, spoiled.any(axis=-1) if spoiled.ndim == 3 else spoiled
 
-    def find_gains(self, name: str) -> AngleGains:
-        """Gains between the images of a view of an ``ANGLES`` capture.
+    def find_gains(self, name: str) -> tuple[AngleGains, ...]:
+        """Gains between the images of a view: of each colour of a mosaic, or of files together.
 
         Raises
         ------
         DataError
             As :meth:`load`.
         """
-        return self._gains_of(*self._angle_stack(self._view(name)))
+        view = self._view(name)
+        if self.files.kind is CaptureKind.MOSAIC:
+            colours, clipped = self._split(view)
+            return tuple(self._gains_of(images, clipped) for images in colours)
+        return (self._gains_of(*self._angle_stack(view)),)
 
     def _gains_of(self, stack: Image, spoiled: Mask) -> AngleGains:
         gray = stack if stack.ndim == 3 else stack.mean(axis=-1)
         usable = ~spoiled & (gray.min(axis=0) >= self.options.darkness)
-        return find_angle_gains(gray, self.files.angles_deg, usable)
+        return find_angle_gains(gray, self._angles_deg, usable)
+
+    @property
+    def _angles_deg(self) -> tuple[float, ...]:
+        mosaic = self.files.kind is CaptureKind.MOSAIC
+        return tuple(map(float, ANGLES_DEG)) if mosaic else self.files.angles_deg
 
     def _from_angles(self, view: ViewFiles) -> Stokes:
         stack, spoiled = self._angle_stack(view)
+        gains: ChannelGains | None = None
         if self.options.equalize:
-            gains = np.array(self._gains_of(stack, spoiled).gains, np.float32)
-            stack = stack / gains.reshape(-1, *(1,) * (stack.ndim - 1))
+            gains = ChannelGains(self._gains_of(stack, spoiled).gains, None)
+        elif self.gains:
+            gains = self.gains[0].common or self.gains[0].of(self._gains_of(stack, spoiled))
+        if gains is not None:
+            factors = np.array(gains.gains, np.float32)
+            stack /= factors.reshape(-1, *(1,) * (stack.ndim - 1))
         planes = [stack] if stack.ndim == 3 else [stack[..., c] for c in range(stack.shape[3])]
         return self._one_colour(
             [
@@ -378,6 +416,7 @@ class Capture:
                     darkness=self.options.darkness,
                     quantum=self._quantum,
                     lossy_variance=self._lossy_variance,
+                    gain_sigma=None if gains is None else gains.sigma,
                 )
                 for plane in planes
             ]
@@ -559,10 +598,8 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
         pattern_check=pattern_check,
         linearity_check=linearity_check,
     )
-    if files.kind is CaptureKind.ANGLES:
-        looked_at = _evenly_chosen(capture.names)
-        gains = tuple(capture.find_gains(name) for name in looked_at)
-        capture = replace(capture, angle_gains=gains)
+    if files.kind is CaptureKind.ANGLES or (mosaic and calibration is None):
+        capture = _with_gains(capture)
     for warning in capture.warnings:
         logger.warning("%s: %s.", files.folder, warning)
     logger.info("%s: %s", files.folder, "; ".join(capture.notes))
@@ -664,9 +701,23 @@ def _survey(
     return first[1], levels, tuple(sorted(orientations)) or (UPRIGHT,), sampled
 
 
-def _evenly_chosen(things: Sequence[T]) -> list[T]:
+def _with_gains(capture: Capture) -> Capture:
+    """With the gains of its polarizer angles."""
+    looked_at = _evenly_chosen(capture.names, GAIN_VIEWS)
+    of_colours = list(zip(*map(capture.find_gains, looked_at), strict=True))
+    constant = capture.files.kind is CaptureKind.MOSAIC
+    found = [capture_gains(views, capture._angles_deg, constant=constant) for views in of_colours]
+    known = tuple(gains for gains in found if gains is not None)
+    return replace(
+        capture,
+        angle_gains=() if constant else of_colours[0],
+        gains=known if len(known) == len(found) else (),
+    )
+
+
+def _evenly_chosen(things: Sequence[T], num: int = CHECKED_IMAGES) -> list[T]:
     """Those that are looked at closely."""
-    places = np.linspace(0, len(things) - 1, min(CHECKED_IMAGES, len(things)))
+    places = np.linspace(0, len(things) - 1, min(num, len(things)))
     return [things[int(place)] for place in places]
 
 

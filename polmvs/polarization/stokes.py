@@ -177,6 +177,7 @@ def stokes_from_intensities(
     darkness: float = CaptureOptions.darkness,
     quantum: float = 1 / 255,
     lossy_variance: float = 0.0,
+    gain_sigma: float | None = None,
 ) -> Stokes:
     """Stokes images and their noise from four angle images.
 
@@ -188,6 +189,8 @@ def stokes_from_intensities(
     darkness : mean of the four below which a pixel counts as dark, share of full scale.
     quantum : step of a raw sample, share of full scale; the noise is at least its rounding.
     lossy_variance : of s1 and s2 by lossy compression, which the redundancy does not show.
+    gain_sigma : deviation of s1 and of s2 by different gains, share of s0; None: as the redundancy
+        shows it.
     """
     if intensities.ndim != 3 or intensities.shape[0] != 4:
         raise ValueError(f"{intensities.shape=} but expected (4, H, W).")
@@ -205,7 +208,8 @@ def stokes_from_intensities(
     # Of s1 and s2, two samples each, by rounding alone.
     floor = 2.0 * INTERPOLATION_NOISE_GAIN * quantum**2 / 12.0
     noise = estimate_noise(s0, redundancy, valid, floor=floor)
-    gain_sigma = _gain_sigma(s0, s1, s2, redundancy[None], valid)
+    if gain_sigma is None:
+        gain_sigma = _gain_sigma(s0, s1, s2, redundancy[None], valid)
     variance = noise.variance(s0)
     variance += _mismatch_variance(s0, redundancy, valid, variance)
     if lossy_variance > 0:
@@ -240,7 +244,7 @@ def stokes_by_least_squares(
     quantum: float = 1 / 255,
     interpolated: bool = False,
     lossy_variance: float = 0.0,
-    gains_known: bool = False,
+    gain_sigma: float | None = None,
 ) -> Stokes:
     """Stokes images and their noise from images behind any three or more analyzers.
 
@@ -250,9 +254,8 @@ def stokes_by_least_squares(
     analyzers : (n, 3), or (n, 3, H, W) where they differ from pixel to pixel; see
         :func:`ideal_analyzers`.
     clipped : (H, W) bool, True where a clipped sample contributes.
-    darkness, quantum, lossy_variance : see :func:`stokes_from_intensities`.
+    darkness, quantum, lossy_variance, gain_sigma : see :func:`stokes_from_intensities`.
     interpolated : the images are bilinear interpolations of a mosaic.
-    gains_known : the analyzers are calibrated, so their gains do not differ.
 
     Raises
     ------
@@ -263,11 +266,11 @@ def stokes_by_least_squares(
     if intensities.ndim != 3 or analyzers.shape[:2] != (num, 3) or num < 3:
         raise ValueError(f"{intensities.shape=}, {analyzers.shape=} but expected (n, H, W), (n, 3)")
     mean = analyzers if analyzers.ndim == 2 else analyzers.mean(axis=(2, 3))
-    u, values, _ = np.linalg.svd(np.asarray(mean, np.float64))
+    values = np.linalg.svd(np.asarray(mean, np.float64), compute_uv=False)
     if values[2] < 1e-3 * values[0]:
         raise ValueError("the analyzers do not determine the Stokes parameters.")
     inverse = np.linalg.pinv(mean)
-    gain = float(np.linalg.eigvalsh(inverse[1:] @ inverse[1:].T)[-1])
+    gain = _noise_gain(inverse)
     flat = np.asarray(intensities, np.float32).reshape(num, -1)
     shape = intensities.shape[1:]
     residual = flat
@@ -281,13 +284,12 @@ def stokes_by_least_squares(
         residual = flat - (rows @ solved)[..., 0].T
         s0, s1, s2 = np.ascontiguousarray(solved[..., 0].T).reshape(3, *shape)
     valid = ~clipped & (s0 >= 2.0 * darkness) & np.isfinite(s0)
-    # Scaled so that its variance is twice that of s1 and s2, as that of four images is.
-    null = (np.sqrt(2.0 * gain) * u[:, 3:].T).astype(np.float32)
-    redundancy = (null @ residual).reshape(num - 3, *shape)
+    redundancy = (null_space(mean).astype(np.float32) @ residual).reshape(num - 3, *shape)
     interpolation = INTERPOLATION_NOISE_GAIN if interpolated else 1.0
     floor = gain * interpolation * quantum**2 / 12.0
     noise, variance = _variance(s0, s1, s2, redundancy, valid, floor, interpolated=interpolated)
-    gain_sigma = 0.0 if gains_known else _gain_sigma(s0, s1, s2, redundancy, valid)
+    if gain_sigma is None:
+        gain_sigma = _gain_sigma(s0, s1, s2, redundancy, valid)
     sigma = np.sqrt(variance + np.float32(lossy_variance))
     return Stokes(
         s0=s0,
@@ -301,6 +303,20 @@ def stokes_by_least_squares(
             intensities, valid, noise, quantum, gain=gain, interpolation=interpolation
         ),
     )
+
+
+def null_space(analyzers: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Combinations (n - 3, n) of n images that are 0 whatever the light.
+
+    Scaled so that their variance is twice that of s1 and s2, as ``I0 + I90 - I45 - I135`` is.
+    """
+    u = np.linalg.svd(np.asarray(analyzers, np.float64))[0]
+    return np.asarray(np.sqrt(2.0 * _noise_gain(np.linalg.pinv(analyzers))) * u[:, 3:].T)
+
+
+def _noise_gain(inverse: NDArray[np.floating[Any]]) -> float:
+    """Variance of s1 and s2 over that of the images, which an inverse (3, n) combines."""
+    return float(np.linalg.eigvalsh(inverse[1:] @ inverse[1:].T)[-1])
 
 
 def _shared_rounding(
@@ -518,9 +534,14 @@ def _gain_sigma(s0: Image, s1: Image, s2: Image, redundancy: Image, valid: Mask)
     if np.count_nonzero(weak) < MIN_SAMPLES:
         weak[:] = True
     shares = [np.median(image[sample][lit][weak] / level[weak]) for image in redundancy]
-    num = len(shares)
-    student = float(stdtrit(num, ONE_SIGMA))
-    return float(student * np.sqrt(np.mean(np.square(shares)) / 2.0))
+    return deviation_of_gains(shares)
+
+
+def deviation_of_gains(shares: ArrayLike) -> float:
+    """Deviation of s1 / s0 and of s2 / s0 by gains that make these redundancies, shares of s0."""
+    known = np.asarray(shares, np.float64)
+    student = float(stdtrit(known.size, ONE_SIGMA))
+    return float(student * np.sqrt(np.mean(np.square(known)) / 2.0))
 
 
 def axial_difference(a: Angles, b: Angles) -> NDArray[np.float64]:

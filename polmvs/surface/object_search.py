@@ -627,17 +627,18 @@ def _space(views: Sequence[_Working], ground: Ground) -> _Cells:
         matrix, right = matrix + across, right + across @ view.center
     middle = np.linalg.lstsq(matrix, right, rcond=None)[0]
     foot = middle - plane.height(middle) * plane.normal
-    reach = float(
-        np.median(
-            [
-                0.5 * min(view.log.shape) * view.pixel_at(float(lengths(view.center - foot)))
-                for view in views
-            ]
-        )
-    )
-    step = 2 * reach / TOL.num_cells
+    away = np.array([view.center - foot for view in views])
+    ranges = lengths(away)
+    reaches = [
+        0.5 * min(view.log.shape) * view.pixel_at(float(one))
+        for view, one in zip(views, ranges, strict=True)
+    ]
+    step = 2 * float(np.median(reaches)) / TOL.num_cells
+    # An upright line is seen under the cosine of the elevation: how much of it fills the images.
+    cosines = np.sqrt(1 - np.minimum(away @ plane.normal / ranges, 1) ** 2)
+    height = float(plane.height(middle) + np.median(reaches / np.maximum(cosines, 0.5)))
     axes = step * np.vstack([plane.axes, plane.normal])
-    shape = (TOL.num_cells, TOL.num_cells, max(round(0.75 * TOL.num_cells), 1))
+    shape = (TOL.num_cells, TOL.num_cells, max(round(height / step), 1))
     origin = foot - 0.5 * (TOL.num_cells - 1) * (axes[0] + axes[1]) + 0.5 * axes[2]
     return _Cells(origin, axes, np.ones(shape, bool))
 
