@@ -1,11 +1,12 @@
-"""What polarizer calibration does to the AoLP: a rendered ball, a faulty sensor, before and after.
+"""What polarizer calibration does to the AoLP of a rendered ball, seen by a faulty sensor.
 
     python pipelines/calibration.py FIGURE.png
 
 The sensor's channels differ by 2 % in gain and 1 degree in angle (standard deviations) and have an
 extinction ratio of 50:1; its samples differ from their channel by a fifth of that. It is calibrated
 from 30 frames each of darkness, of a uniform source, and of that source behind a polarizer at eight
-angles, with photon and read noise; then it sees the ball once, 12 bits.
+angles, with photon and read noise; then it sees the ball once, 12 bits. Without a calibration, its
+gains are those of unpolarized light.
 """
 
 from __future__ import annotations
@@ -88,8 +89,9 @@ def measure() -> tuple[dict[str, Array], Array]:
         write_calibration(path, _response(faulty, shape, rng))
         given = CaptureOptions(full_scale=4095)
         for name, sensor, options in (
-            ("before", faulty, given),
-            ("after", faulty, replace(given, calibration=path)),
+            ("as recorded", faulty, given),
+            ("gains found", faulty, given),
+            ("calibrated", faulty, replace(given, calibration=path)),
             ("ideal sensor", ideal, given),
         ):
             samples = sensor.expose(light, np.random.default_rng(SEED))
@@ -97,7 +99,10 @@ def measure() -> tuple[dict[str, Array], Array]:
             capture.mkdir()
             deep = np.clip(np.rint(samples * 4095), 0, 4095).astype(np.uint16)
             cv2.imwrite(str(capture / "ball.png"), deep)
-            stokes = open_capture(capture, options).load("ball.png")
+            opened = open_capture(capture, options)
+            if name == "as recorded":
+                opened = replace(opened, gains=())
+            stokes = opened.load("ball.png")
             error = np.degrees(axial_difference(stokes.aolp, np.nan_to_num(truth.aolp)))
             errors[name] = np.where(shown, error, np.nan)
     return errors, np.nan_to_num(truth.dolp)
@@ -123,19 +128,20 @@ def _response(sensor: FaultySensor, shape: tuple[int, int], rng: np.random.Gener
 
 
 def draw(path: Path, errors: dict[str, Array]) -> None:
-    """Write the figure: maps of the error before and after, and its distributions."""
+    """Write the figure: maps of the error without and with calibration, and its distributions."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     axes = figure.subplots(1, 3, width_ratios=(1, 1, 1.1))
-    for axis, name in zip(axes, ("before", "after"), strict=False):
+    for axis, name in zip(axes, ("as recorded", "calibrated"), strict=False):
         image = axis.imshow(errors[name], cmap="RdBu", vmin=-3, vmax=3, interpolation="nearest")
         axis.set_title(f"{name}: {_rms(errors[name]):.2f} deg rms")
         axis.set_axis_off()
     figure.colorbar(image, ax=axes[:2], label="AoLP error, deg", shrink=0.8)
     bins = np.linspace(-4, 4, 81)
-    for name, colour in (("before", "#D55E00"), ("after", "#0072B2"), ("ideal sensor", "#666666")):
+    colours = ("#D55E00", "#009E73", "#0072B2", "#666666")
+    for name, colour in zip(errors, colours, strict=True):
         values = errors[name][np.isfinite(errors[name])]
         style = "--" if name == "ideal sensor" else "-"
         axes[2].hist(

@@ -195,7 +195,8 @@ def _write_top(truth: GroundTruth, folder: Path) -> None:
         normals = truth.normals(name).astype(np.float64)
         upwards = normals @ view.cam_from_world.rotation[:, 2] > 0.5  # not where they are NaN
         depth = np.nan_to_num(truth.depth(name)).astype(np.float64)
-        write_true_maps(folder / stem_of(name), depth, normals, upwards)
+        unit = truth.depth_unit_m
+        write_true_maps(folder / stem_of(name), depth, normals, upwards, depth_unit_m=unit)
 
 
 def _turn() -> np.ndarray:

@@ -2,7 +2,8 @@
 
 The layout is that of ``gt/`` in the bundled capture: ``cameras.json`` with ``width``, ``height``
 and, for each image, ``K`` of the half-size polarization image (COLMAP's pixel convention) and
-``cam_from_world`` (3x4, metres); beside it ``STEM_depth.png`` (uint16, 20 um, 0 = nothing),
+``cam_from_world`` (3x4, metres); beside it ``STEM_depth.png`` (uint16 in 20 um, or in the
+``depth_unit_m`` of ``cameras.json``; 0 = nothing),
 ``STEM_normal.png`` (16-bit RGB, camera frame, ``n = value / 32767.5 - 1``) and ``STEM_mask.png``
 (not 0 on the part). Of images with distortion the maps are of the same pixels, ``K`` is the camera
 without its distortion, and ``plane_xy.npy``, (H, W, 2), has ``(x / z, y / z)`` of the rays through
@@ -65,10 +66,12 @@ class GroundTruth:
     ----------
     folder : folder of ``cameras.json``.
     views : posed true cameras by image name, of the half-size images, metres.
+    depth_unit_m : of the depth maps' samples.
     """
 
     folder: Path
     views: Mapping[str, View]
+    depth_unit_m: float = DEPTH_UNIT_M
     _surfaces: dict[tuple[float, float], TrueSurfacePoints] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -113,7 +116,7 @@ class GroundTruth:
         """Depth z of the whole scene, ``(H, W)`` float32, m; NaN where there is nothing."""
         depth = self._image(name, "depth", np.uint16, 2).astype(np.float32)
         depth[depth == 0] = np.nan
-        depth *= np.float32(DEPTH_UNIT_M)
+        depth *= np.float32(self.depth_unit_m)
         return depth
 
     def normals(self, name: str) -> NDArray[np.float32]:
@@ -190,7 +193,8 @@ def open_ground_truth(folder: str | Path) -> GroundTruth:
     cameras_path = root / "cameras.json"
     if not cameras_path.is_file():
         raise DataError(cameras_path, "missing; give a folder with ground truth.")
-    truth = GroundTruth(folder=root, views=read_views(cameras_path))
+    views, depth_unit_m = _read_cameras(cameras_path)
+    truth = GroundTruth(folder=root, views=views, depth_unit_m=depth_unit_m)
     for name in truth.names:
         for kind in ("depth", "normal", "mask"):
             path = _map_path(root, name, kind)
@@ -213,6 +217,11 @@ def _read_png(path: Path) -> NDArray[np.generic]:
 
 def read_views(path: Path) -> dict[str, View]:
     """Views by image name of a ``cameras.json``; DataError where it is malformed."""
+    return _read_cameras(path)[0]
+
+
+def _read_cameras(path: Path) -> tuple[dict[str, View], float]:
+    """Views by image name, and the unit of depth, m."""
     try:
         content = parse_json(read_text(path))
     except (OSError, ValueError) as error:
@@ -220,14 +229,23 @@ def read_views(path: Path) -> dict[str, View]:
     try:
         width, height = int(content["width"]), int(content["height"])
         images = dict(content["images"])
+        unit = float(content.get("depth_unit_m", DEPTH_UNIT_M))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(path, f"needs integer width, height and images; {_REMEDY}.") from error
     if not images or min(width, height) <= 0 or max(width, height) > MAX_SIDE:
         raise DataError(path, f"lists no image or no size; {_REMEDY}.")
-    return {name: _parse_view(path, name, entry, width, height) for name, entry in images.items()}
+    if not 0 < unit < np.inf:
+        raise DataError(path, f"has a depth_unit_m of {unit}; {_REMEDY}.")
+    views = {name: _parse_view(path, name, entry, width, height) for name, entry in images.items()}
+    return views, unit
 
 
-def write_views(path: Path, views: Sequence[View]) -> None:
+def depth_unit(farthest_m: float) -> float:
+    """Unit of depth maps, m: the usual one, or one with which 16 bits reach this depth."""
+    return max(DEPTH_UNIT_M, farthest_m / np.iinfo(np.uint16).max)
+
+
+def write_views(path: Path, views: Sequence[View], *, depth_unit_m: float = DEPTH_UNIT_M) -> None:
     """Write a ``cameras.json`` of views of pinhole cameras of one size.
 
     Raises
@@ -244,7 +262,8 @@ def write_views(path: Path, views: Sequence[View]) -> None:
             "cam_from_world": np.column_stack([pose.rotation, pose.translation]).tolist(),
         }
     size = {"width": views[0].camera.width, "height": views[0].camera.height}
-    write_json(path, {**size, "images": images})
+    unit = {} if depth_unit_m == DEPTH_UNIT_M else {"depth_unit_m": depth_unit_m}
+    write_json(path, {**size, **unit, "images": images})
 
 
 def _parse_view(path: Path, name: str, entry: Any, width: int, height: int) -> View:
@@ -330,7 +349,14 @@ def _is_smooth(depth: Array) -> Mask:
     return np.asarray(bend < MAX_RELATIVE_BEND * inverse, np.bool_)
 
 
-def write_true_maps(stem: Path, depth: Array, normals_in_cam: Array, mask: Mask) -> None:
+def write_true_maps(
+    stem: Path,
+    depth: Array,
+    normals_in_cam: Array,
+    mask: Mask,
+    *,
+    depth_unit_m: float = DEPTH_UNIT_M,
+) -> None:
     """Write the maps of one view, ``STEM_depth.png``, ``STEM_mask.png`` and ``STEM_normal.png``.
 
     Parameters
@@ -338,13 +364,14 @@ def write_true_maps(stem: Path, depth: Array, normals_in_cam: Array, mask: Mask)
     depth : (H, W), m; depths too large for 16 bits become unknown.
     normals_in_cam : (H, W, 3), of the part.
     mask : (H, W), where the part is seen.
+    depth_unit_m : as in ``cameras.json``.
 
     Raises
     ------
     DataError
         The system refuses.
     """
-    encoded = np.rint(depth / DEPTH_UNIT_M)
+    encoded = np.rint(depth / depth_unit_m)
     encoded = np.where(encoded <= np.iinfo(np.uint16).max, encoded, 0)
     write_png(f"{stem}_depth.png", encoded.astype(np.uint16))
     write_mask(f"{stem}_mask.png", mask)

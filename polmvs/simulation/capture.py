@@ -24,6 +24,7 @@ from polmvs.config import to_plain
 from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.geometry import RigidTransform
 from polmvs.io.clouds import Mesh, write_mesh
+from polmvs.io.ground_truth import depth_unit
 from polmvs.io.images import write_bytes, write_mask, write_png
 from polmvs.io.intrinsics import write_intrinsics
 from polmvs.io.plain_files import read_text
@@ -57,7 +58,7 @@ from polmvs.simulation.picture import Picture, expose_picture, render_picture
 from polmvs.simulation.renderer_import import Renderer, import_renderer
 from polmvs.simulation.scene import MitsubaScene, SceneDescription, build_scene
 from polmvs.simulation.sensor import Channels, draw_channels, stated_sigma
-from polmvs.simulation.surroundings import surroundings
+from polmvs.simulation.surroundings import TABLE_SIDE, surroundings
 from polmvs.simulation.truth import CAMERAS_FILE, true_maps, write_cameras, write_truth
 
 logger = logging.getLogger(__name__)
@@ -172,7 +173,8 @@ def simulate_capture(
         if view.name not in finished:
             found[view.name] = _write_view(out, studio, index, exposure)
         on_progress(1)
-    write_cameras(out / "gt", plan.views)  # written last: it completes the ground truth
+    # Written last: it completes the ground truth.
+    write_cameras(out / "gt", plan.views, depth_unit_m=plan.depth_unit_m)
     return SimulatedCapture(
         folder=out,
         views=found,
@@ -193,6 +195,12 @@ class _Plan:
     views: list[View]
     description: SceneDescription
     channels: Channels
+
+    @property
+    def depth_unit_m(self) -> float:
+        """Of the true depth maps: all of the table fits."""
+        away = [float(np.linalg.norm(view.center_in_world - self.target)) for view in self.views]
+        return depth_unit(max(away) + np.sqrt(0.5) * TABLE_SIDE * self.size)
 
     @classmethod
     def make(cls, source: str | Path | Mesh, options: Simulation) -> _Plan:
@@ -477,7 +485,7 @@ def _write_view(out: Path, studio: _Studio, index: int, exposure: float) -> Simu
     scene = studio.scene(view)
     picture = studio.render(scene, index, exposure)
     maps = true_maps(scene, view)
-    write_truth(out / "gt", view, maps, picture)
+    write_truth(out / "gt", view, maps, picture, depth_unit_m=plan.depth_unit_m)
     if options.rendering.masks:
         write_mask(out / "masks" / view.name, maps[2])
     rng = np.random.default_rng([options.rendering.seed, 3, index])

@@ -76,7 +76,12 @@ def _cast_one_by_one(
 
 
 def write_truth(
-    folder: Path, view: View, maps: tuple[Array, Array, Mask], picture: Picture
+    folder: Path,
+    view: View,
+    maps: tuple[Array, Array, Mask],
+    picture: Picture,
+    *,
+    depth_unit_m: float,
 ) -> None:
     """Write the ground truth of one view.
 
@@ -87,7 +92,7 @@ def write_truth(
     """
     depth, normals, mask = maps
     stem = folder / stem_of(view.name)
-    write_true_maps(stem, depth, normals, mask)
+    write_true_maps(stem, depth, normals, mask, depth_unit_m=depth_unit_m)
     stokes = _at_pixels(picture.stokes, mask.shape)
     if picture.diffuse is not None:
         diffuse = _at_pixels(picture.diffuse, mask.shape)
@@ -98,7 +103,7 @@ def write_truth(
     save_array(Path(f"{stem}_stokes.npy"), channels_first)
 
 
-def write_cameras(folder: Path, views: Sequence[View]) -> None:
+def write_cameras(folder: Path, views: Sequence[View], *, depth_unit_m: float) -> None:
     """Write ``cameras.json``; for a distorted lens the camera without distortion, and its rays.
 
     Raises
@@ -111,7 +116,7 @@ def write_cameras(folder: Path, views: Sequence[View]) -> None:
         rays = camera.rays(pixel_centers(camera.width, camera.height))
         save_array(folder / "plane_xy.npy", np.asarray(rays[..., :2] / rays[..., 2:], np.float32))
     plain = [replace(view, camera=pinhole_of(view.camera)) for view in views]
-    write_views(folder / CAMERAS_FILE, plain)
+    write_views(folder / CAMERAS_FILE, plain, depth_unit_m=depth_unit_m)
 
 
 def _at_pixels(image: Array, shape: tuple[int, ...]) -> Array:

@@ -11,7 +11,7 @@ import pytest
 
 import polmvs
 from polmvs.errors import DataError
-from polmvs.io.ground_truth import GroundTruth, open_ground_truth
+from polmvs.io.ground_truth import GroundTruth, depth_unit, open_ground_truth
 from polmvs.neighbors import in_cells_beside, nearest_points, voxel_representatives
 
 DEMO = Path(polmvs.__file__).parent / "demo_capture"
@@ -50,6 +50,14 @@ def test_maps_have_units_and_nan(demo: GroundTruth) -> None:
     assert np.isnan(depth).any()
     np.testing.assert_array_equal(np.isfinite(normals).all(axis=-1), mask)
     np.testing.assert_allclose(np.linalg.norm(normals[mask], axis=-1), 1.0, atol=1e-6)
+
+
+def test_far_depths_have_a_coarser_unit(copy: Path, demo: GroundTruth) -> None:
+    content = json.loads((copy / "cameras.json").read_text())
+    (copy / "cameras.json").write_text(json.dumps({**content, "depth_unit_m": depth_unit(6.5)}))
+    far, near = open_ground_truth(copy), demo.depth("000.png")
+    np.testing.assert_allclose(far.depth("000.png"), near * 6.5 / 65535 / 20e-6, rtol=1e-6)
+    assert depth_unit(1.3) == 20e-6  # of usual captures
 
 
 def test_surface_is_the_board_and_its_surroundings(demo: GroundTruth) -> None:
@@ -93,6 +101,11 @@ def _spoil_json(folder: Path) -> None:
     (folder / "cameras.json").write_text('{"width": 4')
 
 
+def _set(folder: Path, key: str, value: object) -> None:
+    content = json.loads((folder / "cameras.json").read_text())
+    (folder / "cameras.json").write_text(json.dumps({**content, key: value}))
+
+
 def _edit(folder: Path, key: str, value: object) -> None:
     content = json.loads((folder / "cameras.json").read_text())
     content["images"]["000.png"][key] = value
@@ -108,6 +121,8 @@ def _edit(folder: Path, key: str, value: object) -> None:
         (lambda f: (f / "cameras.json").write_text("[]"), "cameras.json: needs integer width"),
         (lambda f: _edit(f, "K", [[1, 2], [3, 4]]), "cameras.json: K of 000.png"),
         (lambda f: _edit(f, "K", "abc"), "cameras.json: 000.png needs numbers"),
+        (lambda f: _set(f, "depth_unit_m", 0), "cameras.json: has a depth_unit_m of 0"),
+        (lambda f: _set(f, "depth_unit_m", "mm"), "cameras.json: needs integer width"),
         (lambda f: _edit(f, "K", [[1, 2, 0], [0, 1, 0], [0, 0, 1]]), "without skew"),
         (lambda f: _edit(f, "cam_from_world", [[1] * 4] * 3), "rigid motion"),
         (lambda f: _edit(f, "cam_from_world", [[float("nan")] * 4] * 3), "rigid motion"),

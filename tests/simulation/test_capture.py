@@ -184,6 +184,21 @@ def test_what_cannot_be_rendered_is_refused(renderer, tmp_path, changes, message
     assert not (tmp_path / "c").exists()
 
 
+def test_a_large_object_has_true_depths(renderer, tmp_path):
+    """Depths of metres are beyond 16 bits of the usual unit."""
+    options = {**SMALL, "image_size": (48, 40), "marks": 0, "surroundings": "nothing"}
+    made = polmvs.simulate("sphere", tmp_path / "c", **options, size=2.0)
+    truth = open_ground_truth(made.folder)
+    assert truth.depth_unit_m > 20e-6
+    for name in truth.names:
+        depth, mask = truth.depth(name), truth.mask(name)
+        points = truth.views[name].cam_from_world.inverse() * (
+            truth.rays(name)[mask] * (depth / truth.rays(name)[..., 2])[mask][:, None]
+        )
+        radius = np.linalg.norm(points - [0, 0, 1], axis=1)
+        assert np.abs(radius - 1).max() < 1e-3  # the chords of the mesh, and the depth's step
+
+
 def test_a_flat_mesh_is_no_object_on_a_table(renderer, tmp_path):
     sheet = "v 0 0 3\nv 1 0 3\nv 0 1 3\nf 1 2 3\n"
     (tmp_path / "sheet.obj").write_text(sheet)

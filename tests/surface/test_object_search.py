@@ -39,19 +39,27 @@ def printed(seed: int = 0) -> np.ndarray:
 
 
 def heights_on_ball(
-    view: View, xy: np.ndarray, middle: np.ndarray = CENTER, radius: float = RADIUS
+    view: View,
+    xy: np.ndarray,
+    middle: np.ndarray = CENTER,
+    radius: float = RADIUS,
+    tall: float = 1.0,
 ) -> np.ndarray:
-    """Heights ``(...)`` above the plane where rays meet the ball; negative where they miss it."""
-    rays, center = view.rays_in_world(xy), view.center_in_world
+    """Heights ``(...)`` above the plane where rays meet the ball; negative where they miss it.
+
+    The ball may be stretched upwards, to ``tall`` times its height.
+    """
+    shrink = np.array([1, 1, 1 / tall])
+    rays, center = unit(view.rays_in_world(xy) * shrink), view.center_in_world * shrink
     along = rays @ (middle - center)
     depth = radius**2 - (lengths(middle - center) ** 2 - along**2)
     hit = center + (along - np.sqrt(np.maximum(depth, 0)))[..., None] * rays
-    return np.where(depth > 0, hit[..., 2], -1.0)
+    return np.where(depth > 0, tall * hit[..., 2], -1.0)
 
 
-def on_ball(view: View, xy: np.ndarray) -> np.ndarray:
+def on_ball(view: View, xy: np.ndarray, tall: float = 1.0) -> np.ndarray:
     """Which rays meet the ball above the plane, ``(...)`` bool."""
-    return heights_on_ball(view, xy) > 0
+    return heights_on_ball(view, xy, tall=tall) > 0
 
 
 def on_small(view: View, xy: np.ndarray, place: tuple[float, float]) -> np.ndarray:
@@ -85,12 +93,13 @@ def photograph(
     shadow: float = 1.0,
     beside: tuple[tuple[float, float], ...] = (),
     waves: float = 0.0,
+    tall: float = 1.0,
 ) -> np.ndarray:
     """Intensity (H, W), each pixel the mean of four rays; beyond ``end`` the table has none.
 
     The upper part of the ball has the brightness ``cap``, as a stripe of the wall beyond the table.
     Under the ball, the table's brightness is multiplied by ``shadow``. Small balls as bright as it
-    are ``beside`` it. The table has ``waves`` of a height.
+    are ``beside`` it. The table has ``waves`` of a height. The ball is ``tall``.
     """
     size = (view.camera.height, view.camera.width)
     total = np.zeros(size, np.float32)
@@ -110,7 +119,7 @@ def photograph(
             shade = np.where((lengths(meets) > end) | (rays[..., 2] > down), wall, shade)
             if lamp:
                 shade = shade * (5 / lengths(meets - center)) ** 2
-            height = heights_on_ball(view, xy)
+            height = heights_on_ball(view, xy, tall=tall)
             own = np.where(height > 0.9, ball if cap is None else cap, ball)
             shade = np.where(on_arm(view, xy, arm), ball, shade)
             for place in beside:
@@ -126,6 +135,13 @@ def aside(view: View, pitch_deg: float, yaw_deg: float) -> View:
     pose = view.cam_from_world
     turned = replace(pose, rotation=turn @ pose.rotation, translation=turn @ pose.translation)
     return replace(view, cam_from_world=turned)
+
+
+def raised(view: View, height: float) -> View:
+    """The view from higher above the table."""
+    pose = view.cam_from_world
+    moved = pose.translation - height * pose.rotation[:, 2]
+    return replace(view, cam_from_world=replace(pose, translation=moved))
 
 
 def finer(view: View) -> View:
@@ -153,11 +169,16 @@ def capture(
     shadow: float = 1.0,
     beside: tuple[tuple[float, float], ...] = (),
     waves: float = 0.0,
+    tall: float = 1.0,
     doublings: int = 1,
     elevations: tuple[float, ...] = (30.0, 55.0),
     aim_deg: float = 0.0,
+    height: float = 0.0,
 ) -> list[PhaseMap]:
-    """Maps of views that look at the ball, up to ``aim_deg`` beside its middle."""
+    """Maps of views that look at the ball, up to ``aim_deg`` beside its middle.
+
+    They may look at a place at a height above it.
+    """
     looks = {
         "ball": ball,
         "cap": cap,
@@ -167,10 +188,11 @@ def capture(
         "shadow": shadow,
         "beside": beside,
         "waves": waves,
+        "tall": tall,
     }
     aims = np.random.default_rng(5).uniform(-aim_deg, aim_deg, (10, 2))
     views = ring_of_views(10, elevations=elevations)
-    views = [aside(view, *aim) for view, aim in zip(views, aims, strict=True)]
+    views = [raised(aside(view, *aim), height) for view, aim in zip(views, aims, strict=True)]
     for _ in range(doublings):
         views = [finer(view) for view in views]
     maps = []
@@ -197,6 +219,7 @@ def table_tracks(
     beside: tuple[tuple[float, float], ...] = (),
     printed_at: tuple[float, float] | None = None,
     waves: float = 0.0,
+    tall: float = 1.0,
 ) -> Tracks:
     """Sparse points of the table, and of one of the small balls, where views see them."""
     rng = np.random.default_rng(2)
@@ -214,7 +237,7 @@ def table_tracks(
         xy, view = one.view.project(points), one.view
         shown = ((xy > 0) & (xy < (view.camera.width, view.camera.height))).all(axis=1)
         shown &= (normals * (view.center_in_world - points)).sum(axis=1) > 0
-        shown &= ~on_ball(view, xy)
+        shown &= ~on_ball(view, xy, tall)
         for place in beside:
             shown[:NUM_POINTS] &= ~on_small(view, xy[:NUM_POINTS], place)
         track = np.flatnonzero(shown)
@@ -256,6 +279,15 @@ def test_a_ball_on_a_crumpled_cloth_is_found_like_one_on_a_table():
     overlaps, places = compared(maps, found)
     assert np.median(overlaps) > 0.9
     assert np.median(np.abs(places)) < 0.4
+
+
+def test_what_is_as_tall_as_the_images_is_found():
+    """Upright, and seen from above: it is taller than the images' height at its distance."""
+    maps = capture(printed(), tall=3.0, elevations=(50.0, 60.0), height=1.7)
+    found = find_object(maps, TABLE, table_tracks(maps, tall=3.0))
+    assert found is not None
+    overlaps, _ = compared(maps, found, tall=3.0)
+    assert np.median(overlaps) > 0.9
 
 
 @pytest.mark.parametrize("ball", [0.6, pytest.param(0.05, marks=pytest.mark.slow)])
@@ -392,13 +424,15 @@ def test_the_shadow_under_the_ball_that_one_view_sees_is_not_the_ball():
     assert min(overlaps) > 0.9
 
 
-def compared(maps: list[PhaseMap], found: list[FoundObject]) -> tuple[list[float], np.ndarray]:
+def compared(
+    maps: list[PhaseMap], found: list[FoundObject], tall: float = 1.0
+) -> tuple[list[float], np.ndarray]:
     """Overlap of each view's mask with the ball, and errors of the outlines' places, px."""
     overlaps, places = [], []
     for one, hiding in zip(maps, found, strict=True):
         camera = one.view.camera
         fine = pixel_centers(4 * camera.width, 4 * camera.height) / 4
-        truth = signed_distance_px(on_ball(one.view, fine)) / 4
+        truth = signed_distance_px(on_ball(one.view, fine, tall)) / 4
         truth = truth.reshape(camera.height, 4, camera.width, 4).mean(axis=(1, 3))
         overlaps.append((hiding.mask & (truth < 0)).sum() / (hiding.mask | (truth < 0)).sum())
         own = smooth_distance_px(hiding.mask) - hiding.outline_shift
