@@ -221,10 +221,11 @@ def capture_gains(
 
     Returns
     -------
-    None if the views show none clearly, or three angles have no misfit.
+    None if the views show none clearly. Three angles have no misfit; with them only views that
+    disagree while the parts of each agree tell gains.
     """
     known = [view for view in views if len(view.parts)]
-    if not known or len(angles_deg) < 4:
+    if not known:
         return None
     logs = np.log([view.gains for view in known])
     images = np.exp(logs)
@@ -234,6 +235,9 @@ def capture_gains(
     of_parts = float(np.median([_spread(view.parts, angles_deg) for view in known]))
     of_views = _spread(logs, angles_deg)
     own = not constant and of_views > of_parts
+    if not len(shares):
+        limit = 4 * max(of_views, SENSOR_SPREAD)
+        return CaptureGains(tuple(angles_deg), of_views, limit, None) if own else None
     known_shares = shares.ravel() if own else np.median(shares, axis=1)
     prior = deviation_of_gains(known_shares)
     limit = 4 * max(prior, SENSOR_SPREAD)

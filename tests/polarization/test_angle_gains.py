@@ -119,5 +119,19 @@ def test_views_that_disagree_show_no_gains():
 
 def test_three_angles_have_no_misfit():
     angles = (0.0, 60.0, 120.0)
-    images, usable = scene(angles, [1.02, 1.0, 0.98])
-    assert capture_gains([find_angle_gains(images, angles, usable)], angles, constant=True) is None
+    usable = np.ones((120, 160), np.bool_)
+    rng = np.random.default_rng(3)
+    for constant in (True, False):
+        truth = rng.normal(0, 0.02, (1 if constant else 8, 3))
+        views = [
+            find_angle_gains(
+                scene(angles, np.exp(truth[k % len(truth)]), seed=k)[0], angles, usable
+            )
+            for k in range(8)
+        ]
+        found = capture_gains(views, angles, constant=False)
+        assert (found is None) == constant
+        if found is not None:  # the views disagree, the parts of each do not
+            for view, own in zip(views, truth, strict=True):
+                expected = np.exp(own - own.mean())
+                np.testing.assert_allclose(found.of(view).gains, expected, rtol=1e-3)
