@@ -75,6 +75,8 @@ class NormalRanges:
         wrong 0.18 and 0.31, under OPA 0.12. The end is that of the surface's own warning.
     moved : share of the surface. Measured, 0 on board, dome, mug and step, to 0.05; of a figure
         whose concave back stayed at the visual hull 0.17. The end is that of ``contradicted``.
+    off_points : share of the sparse points. Measured, 0 to 0.2; of a teapot whose lid is too high
+        0.4. The end is a guess in the gap.
     cut : measured, see :mod:`polmvs.polarization.mask_check`.
 
     Measured on right reconstructions: five rendered captures (``board``, ``dome``, ``demo``,
@@ -97,6 +99,7 @@ class NormalRanges:
     left_out: tuple[float, float] = (0.0, 0.25)
     contradicted: tuple[float, float] = (0.0, MAX_SHARE)
     moved: tuple[float, float] = (0.0, MAX_SHARE)
+    off_points: tuple[float, float] = (0.0, 0.25)
     cut: tuple[float, float] = (0.0, MAX_CUT_SHARE)
 
 
@@ -172,6 +175,7 @@ class Trust:
     fitted : all views, predicted from the surface; None without a surface of all views.
     soundness : of the mesh; likewise.
     contradicted_share : share of the surface that its phases contradict; likewise.
+    off_points : share of the sparse points with a normal that are off the surface; None if few.
     complaints : errors that earlier stages found (cameras, pattern, light), one clause each.
     cut_share : share of the band outside of the user's masks that is as polarized as a surface;
         None without masks.
@@ -192,6 +196,7 @@ class Trust:
     fitted: Prediction | None = None
     soundness: Soundness | None = None
     contradicted_share: float | None = None
+    off_points: float | None = None
     complaints: tuple[str, ...] = ()
     cut_share: float | None = None
     is_bounded: bool = True
@@ -252,6 +257,10 @@ class Trust:
                 # An open scene lacks things without sparse points; what closes the gap is left out.
                 decides=self.is_bounded,
             )
+        if self.off_points is not None:
+            name = "sparse points with a normal that are off the surface, %"
+            remedy = "parts that are too high or too low; more marks there"
+            yield _figure(name, self.off_points, ranges.off_points, remedy)
         if self.soundness is not None:
             views = "views that contradict each other: poses, `region.mask`"
             name = "lines of sight through a double layer of the surface, %"

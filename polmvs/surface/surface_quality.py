@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse, special
 
-from polmvs.camera import sample_image
+from polmvs.camera import in_image, sample_image
 from polmvs.fitting import like_most, robust_deviation
-from polmvs.geometry import dots, unit
+from polmvs.geometry import dots, lengths, unit
 from polmvs.normals.estimator import solve_normals
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS
 from polmvs.surface.creases import CreaseTolerances, SideAverage
@@ -658,6 +658,29 @@ def _offsets(
     offset = dots(place - known.points, mesh.face_normals[face])
     # Points farther than the width of the hull's cells are not on the surface.
     return offset, face, np.abs(offset) < HullTolerances.step_px * gsd
+
+
+def share_off(mesh: TriangleMesh, known: KnownPoints, views: Sequence[SurfaceView]) -> float | None:
+    """Share of the known points within the silhouettes that are off a surface; None with few.
+
+    Off is farther than an edge and than three deviations of the point. Single points are on mirror
+    images; many off the surface contradict it.
+    """
+    num_seen, num_inside = np.zeros((2, len(known.points)))
+    for view in views:
+        xy = view.view.project(known.points)
+        shown = view.silhouette.certain | view.silhouette.possible
+        shown = ndimage.binary_dilation(shown, iterations=2)  # a point of the outline is inside
+        num_seen += in_image(view.view.camera, xy)
+        num_inside += sample_image(shown.astype(np.float32), xy, nearest=True) > 0
+    # A point of an object lies in its silhouettes, hidden or not; 5 % may be wrong.
+    of_object = (num_seen > 0) & (num_inside >= 0.95 * num_seen)
+    if of_object.sum() < 2 * MIN_POINTS or not len(mesh.faces):
+        return None
+    points, sigma = known.points[of_object], known.sigma[of_object]
+    place, _, _ = RayScene(mesh).closest(points)
+    limit = np.maximum(mesh.mean_edge, 3 * sigma)
+    return float(np.mean(lengths(place - points) > limit))
 
 
 def point_offset(

@@ -17,11 +17,13 @@ from polmvs.surface.surface_quality import (
     disagreement_deg,
     fit_normals,
     misfit,
+    share_off,
     stand_apart,
     supported_faces,
     view_information,
 )
 from polmvs.surface.surface_view import Silhouette, surface_view
+from polmvs.surface.terms import KnownPoints
 
 NAN = np.nan
 
@@ -79,6 +81,19 @@ def test_normals_err_by_their_stated_deviation(exact):
     # few views have a larger jackknife than variance (Efron and Stein 1981).
     assert 0.6 < (ratio < 1).mean() < 0.85
     assert (ratio < 2).mean() > 0.93
+
+
+@pytest.mark.parametrize(("num", "num_sunk", "share"), [(60, 6, 0.1), (60, 24, 0.4), (12, 6, None)])
+def test_known_points_off_the_surface_are_counted(exact, num, num_sunk, share):
+    directions = np.random.default_rng(0).normal(size=(num, 3))
+    points = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    points[:num_sunk] *= 0.8
+    points = np.concatenate([points, [[3.0, 0.0, 0.0]] * 40])  # beside the silhouettes
+    known = KnownPoints(points, np.full(num + 40, 0.01))
+    assert share_off(exact, known, fit_of(0.0).views) == share
+    # What a deviation explains is not off.
+    uncertain = KnownPoints(points, np.full(num + 40, 0.1))
+    assert share_off(exact, uncertain, fit_of(0.0).views) == (None if share is None else 0.0)
 
 
 def test_normals_that_all_views_turn_alike_disagree_with_the_mesh(exact):

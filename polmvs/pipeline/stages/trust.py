@@ -40,6 +40,7 @@ from polmvs.surface.observations import (
 )
 from polmvs.surface.open_scene import open_scene
 from polmvs.surface.soundness import find_soundness
+from polmvs.surface.surface_quality import share_off
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.surroundings import sparse_surroundings
 from polmvs.surface.terms import KnownPoints, TermTolerances
@@ -135,6 +136,7 @@ def _contradicted(
     return replace(
         trust,
         complaints=(*trust.complaints, *(() if wrong_camera is None else (wrong_camera,))),
+        off_points=share_off(mesh, known, seen) if made.is_bounded else None,
         predicted=predict_left_out(
             seen, plane, looking, known, scene=scene, whole=whole, outside=outside
         ),
