@@ -75,8 +75,8 @@ class NormalRanges:
         wrong 0.18 and 0.31, under OPA 0.12. The end is that of the surface's own warning.
     moved : share of the surface. Measured, 0 on board, dome, mug and step, to 0.05; of a figure
         whose concave back stayed at the visual hull 0.17. The end is that of ``contradicted``.
-    off_points : share of the sparse points. Measured, 0 to 0.2; of a teapot whose lid is too high
-        0.4. The end is a guess in the gap.
+    off_points : share of the sparse points. Measured, 0 to 0.12; of a teapot whose lid is too high
+        0.36. The end is a guess in the gap.
     cut : measured, see :mod:`polmvs.polarization.mask_check`.
 
     Measured on right reconstructions: five rendered captures (``board``, ``dome``, ``demo``,

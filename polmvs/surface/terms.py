@@ -598,7 +598,7 @@ def add_points(
     face, residual, sigma = face[near], residual[near], sigma[near]
     along = dots(mesh.vertex_normals[mesh.faces[face]], normals[near][:, None])
     jacobian = barycentric[near] * along
-    scale = np.maximum(4 * sigma, mesh.mean_edge) ** 2  # as far as such a mesh may be off
+    scale = np.maximum(4 * sigma, 0.1 * gate_px * gsd) ** 2
     weights = weight * geman_mcclure_weights(residual, scale) / sigma**2
     equations.add(mesh.faces[face], jacobian, residual, weights)
 

@@ -185,6 +185,7 @@ def test_noisy_phases_of_weak_polarization_are_no_contradiction():
         ({"soundness": Soundness(layered=0.2, overlapping=0.0)}, "double layer.* 20 "),
         ({"soundness": Soundness(layered=0.0, overlapping=0.1)}, "intersects itself.* 10 "),
         ({"contradicted_share": 0.18}, "that its phases contradict, %: 18 "),
+        ({"off_points": 0.4}, "with a normal that are off the surface, %: 40 "),
         ({"left_out": 5}, "a pose or inconsistent, %: 41.7 "),
         ({"num_views": 3}, "3 views leave none to check"),
         ({"residual_deg": 6.0, "residual_sigmas": 2.0}, "beyond noise, median, deg: 5.65 "),

@@ -538,29 +538,6 @@ def test_deviations_are_larger_where_less_is_known(ball):
     assert np.isinf(few[behind]).any()
 
 
-def test_points_on_a_sunk_lid_bring_it_down():
-    """Neither phases nor outlines show how deep it lies; points tell, 6 px below the hull."""
-
-    def cylinder(radius, low, high):
-        def distance(p):
-            aside = np.hypot(p[..., 0], p[..., 1]) - radius
-            return np.max([aside, low - p[..., 2], p[..., 2] - high], axis=0)
-
-        return distance
-
-    whole, sunk = cylinder(1.0, -0.5, 0.5), cylinder(0.8, 0.3, 0.8)
-    views = views_of(
-        lambda p: np.maximum(whole(p), -sunk(p)), ring_of_views(12, elevations=(30.0, 55.0))
-    )
-    rng = np.random.default_rng(0)
-    xy = rng.uniform(-0.5, 0.5, (60, 2))
-    known = KnownPoints(np.column_stack([xy, np.full(60, 0.3)]), np.full(60, 0.3 * GSD))
-    mesh = refined(visual_hull(views), views, tolerances=None, known=known).mesh
-    lid = mesh.centers[(mesh.face_normals[:, 2] > 0.9) & (np.hypot(*mesh.centers.T[:2]) < 0.5)]
-    # 0.0 px; 6.6 if points far from the coarse surface count as outliers.
-    assert abs(np.median(lid[:, 2]) - 0.3) < 0.3 * GSD
-
-
 def test_waves_are_as_high_as_they_are():
     """Seen at the wrong place, phases of a curved surface differ by the view, and their mean is
     that of a flatter one: only their change with the place brings it right."""
