@@ -76,7 +76,7 @@ class NormalRanges:
     moved : share of the surface. Measured, 0 on board, dome, mug and step, to 0.05; of a figure
         whose concave back stayed at the visual hull 0.17. The end is that of ``contradicted``.
     off_points : share of the sparse points. Measured, 0 to 0.12; of a teapot whose lid is too high
-        0.36. The end is a guess in the gap.
+        0.40. The end is a guess in the gap.
     cut : measured, see :mod:`polmvs.polarization.mask_check`.
 
     Measured on right reconstructions: five rendered captures (``board``, ``dome``, ``demo``,

@@ -7,7 +7,7 @@ the same polarization everywhere, next to which that of a grey or white surface 
 Where light is unpolarized, the ratios of the images are those of the gains, the same at all pixels
 (and, for the filters of a sensor, in all views). On polarized surfaces the ratios vary. So the most
 frequent ratios are those of the gains (:func:`find_angle_gains`), and their spread over views or
-over the parts of a view is the error (:func:`channel_gains`).
+over the parts of a view is the error (:func:`capture_gains`).
 
 Four or more angles separate a gain from uniformly polarized light: linear images fit three Stokes
 parameters, images of different gains do not. The misfit tells how large the gains can be.

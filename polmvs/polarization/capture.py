@@ -11,6 +11,7 @@ import logging
 import math
 import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.arrays import Image, Mask
-from polmvs.config import CaptureKind, CaptureOptions, Channel, Resolution
+from polmvs.config import CaptureKind, CaptureOptions, Channel, Resolution, default_num_workers
 from polmvs.errors import DataError, OptionError
 from polmvs.io.capture_files import CaptureFiles, ViewFiles, find_capture
 from polmvs.io.raw_formats import (
@@ -704,7 +705,9 @@ def _survey(
 def _with_gains(capture: Capture) -> Capture:
     """With the gains of its polarizer angles."""
     looked_at = _evenly_chosen(capture.names, GAIN_VIEWS)
-    of_colours = list(zip(*map(capture.find_gains, looked_at), strict=True))
+    # Threads, as decoding releases Python's lock.
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        of_colours = list(zip(*pool.map(capture.find_gains, looked_at), strict=True))
     constant = capture.files.kind is CaptureKind.MOSAIC
     found = [capture_gains(views, capture._angles_deg, constant=constant) for views in of_colours]
     known = tuple(gains for gains in found if gains is not None)
