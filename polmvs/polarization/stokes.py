@@ -35,11 +35,12 @@ Gains
 Polarizer channels differ in gain, by some percent on real sensors. A capture divides by those that
 unpolarized light shows (:mod:`polmvs.polarization.angle_gains`). All pixels share the error that
 is left and no smoothing reduces it, so it is separate from ``sigma``: ``gain_sigma``. If no light
-is clearly unpolarized, the misfit tells how large the gains may be: ``1 + e_k`` of equal spread make ``r / s0 = (e0 + e90 - e45 - e135) / 2`` in unpolarized light, and
-independent of it ``(e0 - e90) / 2`` and ``(e45 - e135) / 2`` of s0 in s1 and s2, each with the
-spread of r / s0 over sqrt(2). With one (n - 3) such known value, the error has Student's
-distribution. Polarized light would show a second combination of gains. It is not used, because
-oblique rays in the polarizers have the same effect. Measured with gains of 2 % spread on rendered
+is clearly unpolarized, the misfit tells how large the gains may be: ``1 + e_k`` of equal spread
+make ``r / s0 = (e0 + e90 - e45 - e135) / 2`` in unpolarized light, and independent of it
+``(e0 - e90) / 2`` and ``(e45 - e135) / 2`` of s0 in s1 and s2, each with the spread of r / s0 over
+sqrt(2). With one (n - 3) such known value, the error has Student's distribution. Polarized light
+would show a second combination of gains. It is not used, because oblique rays in the polarizers
+have the same effect. Measured with gains of 2 % spread on rendered
 captures: without this term the error of the AoLP is within one sigma for 33 % of the pixels; the
 test ``test_sigma_covers_gain_errors`` has the value with it.
 """
