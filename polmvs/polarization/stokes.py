@@ -33,7 +33,7 @@ does not turn the phase. With this, a capture has the same weights in every form
 Gains
 -----
 Polarizer channels differ in gain, by some percent on real sensors. A capture divides by those that
-unpolarized light shows (:mod:`polmvs.polarization.angle_gains`). All pixels share the error that
+unpolarized light shows (``polmvs.polarization.angle_gains``). All pixels share the error that
 is left and no smoothing reduces it, so it is separate from ``sigma``: ``gain_sigma``. If no light
 is clearly unpolarized, the misfit tells how large the gains may be: ``1 + e_k`` of equal spread
 make ``r / s0 = (e0 + e90 - e45 - e135) / 2`` in unpolarized light, and independent of it
