@@ -224,7 +224,8 @@ def capture_gains(
     None if the views show none clearly. Three angles have no misfit; with them only views that
     disagree while the parts of each agree tell gains.
     """
-    known = [view for view in views if len(view.parts)]
+    # Larger ratios are exposures, which the user is asked about.
+    known = [view for view in views if len(view.parts) and view.ratio <= TOL.min_ratio]
     if not known:
         return None
     logs = np.log([view.gains for view in known])

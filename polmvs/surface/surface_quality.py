@@ -9,8 +9,9 @@ because a hole would show the inside.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -660,17 +661,25 @@ def _offsets(
     return offset, face, np.abs(offset) < HullTolerances.step_px * gsd
 
 
-def share_off(mesh: TriangleMesh, known: KnownPoints, views: Sequence[SurfaceView]) -> float | None:
+def share_off(
+    mesh: TriangleMesh,
+    known: KnownPoints,
+    views: Sequence[SurfaceView],
+    outside: Mapping[str, Mask] = MappingProxyType({}),
+) -> float | None:
     """Share of the known points within the silhouettes that are off a surface; None with few.
 
     Off is farther than an edge and than three deviations of the point. Single points are on mirror
-    images; many off the surface contradict it.
+    images; many off the surface contradict it. ``outside`` are pixels (H, W) of views, by name,
+    that show what a box cut away.
     """
     num_seen, num_inside = np.zeros((2, len(known.points)))
     for view in views:
         xy = view.view.project(known.points)
         shown = view.silhouette.certain | view.silhouette.possible
         shown = ndimage.binary_dilation(shown, iterations=2)  # a point of the outline is inside
+        if view.view.name in outside:
+            shown &= ~outside[view.view.name]
         num_seen += in_image(view.view.camera, xy)
         num_inside += sample_image(shown.astype(np.float32), xy, nearest=True) > 0
     # A point of an object lies in its silhouettes, hidden or not; 5 % may be wrong.

@@ -94,6 +94,10 @@ def test_known_points_off_the_surface_are_counted(exact, num, num_sunk, share):
     # What a deviation explains is not off.
     uncertain = KnownPoints(points, np.full(num + 40, 0.1))
     assert share_off(exact, uncertain, fit_of(0.0).views) == (None if share is None else 0.0)
+    # Nor does what a box cuts away count.
+    views = fit_of(0.0).views
+    cut = {one.view.name: np.ones_like(one.silhouette.certain) for one in views}
+    assert share_off(exact, known, views, cut) is None
 
 
 def test_normals_that_all_views_turn_alike_disagree_with_the_mesh(exact):

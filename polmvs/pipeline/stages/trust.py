@@ -136,7 +136,7 @@ def _contradicted(
     return replace(
         trust,
         complaints=(*trust.complaints, *(() if wrong_camera is None else (wrong_camera,))),
-        off_points=share_off(mesh, known, seen) if made.is_bounded else None,
+        off_points=share_off(mesh, known, seen, outside) if made.is_bounded else None,
         predicted=predict_left_out(
             seen, plane, looking, known, scene=scene, whole=whole, outside=outside
         ),
