@@ -22,6 +22,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from polmvs.arrays import Array, Image, Mask
+from polmvs.fitting import robust_deviation
 from polmvs.polarization.stokes import (
     deviation_of_gains,
     ideal_analyzers,
@@ -124,7 +125,7 @@ def find_angle_gains(images: Image, angles_deg: Sequence[float], usable: Mask) -
     _, inverse, counts = np.unique(bins, axis=1, return_inverse=True, return_counts=True)
     first = np.median(ratios[:, inverse.ravel() == int(np.argmax(counts))], axis=1)
     # The median in windows that shrink to the noise: differences between neighbours along a row.
-    noise = np.median(np.abs(np.diff(ratios, axis=1))) / (0.6745 * np.sqrt(2))
+    noise = robust_deviation(np.diff(ratios, axis=1)) / np.sqrt(2)
     center = _mode(ratios, first, noise, MIN_PATCHES)
     if center is None:
         return alike
@@ -195,9 +196,7 @@ class CaptureGains:
         return f"gains of the polarizer angles differ {what}; divided by those of unpolarized light"
 
     def of(self, view: AngleGains) -> ChannelGains | None:
-        """Gains of a view; None if it does not show them."""
-        if self.common is not None:
-            return self.common
+        """Gains of a view of its own; None if it does not show them."""
         if view.ratio > TOL.min_ratio or not len(view.parts):
             return None
         return _estimate(view.parts, self)
@@ -278,7 +277,7 @@ def _axial(logs: Array, angles_deg: Sequence[float]) -> Array:
 def _spread(logs: Array, angles_deg: Sequence[float]) -> float:
     """Robust deviation of what logarithms of gains (N, K) feign, the larger of both components."""
     axial = _axial(logs, angles_deg)
-    return float(np.median(np.abs(axial - np.median(axial, axis=0)), axis=0).max() / 0.6745)
+    return max(robust_deviation(own - np.median(own)) for own in axial.T)
 
 
 def _misfit(samples: Array, angles_deg: Sequence[float]) -> float:

@@ -171,7 +171,7 @@ class Capture:
             lines.append(self.pattern_check.message)
         if self.linearity_check is not None and self.linearity_check.fits is not False:
             lines.append(self.linearity_check.message)
-        lines.extend({gains.message: None for gains in self.gains if gains.message is not None})
+        lines.extend(gains.message for gains in self.gains if gains.message is not None)
         return tuple(lines)
 
     @property
