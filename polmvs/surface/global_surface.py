@@ -73,6 +73,7 @@ from polmvs.surface.solver import (
     refine,
 )
 from polmvs.surface.surface_quality import (
+    MAX_OFF,
     MAX_SHARE,
     MIN_EXPLAINED,
     Contradictions,
@@ -88,6 +89,7 @@ from polmvs.surface.surface_quality import (
     pixel_information,
     point_offset,
     points_deny,
+    share_off,
     stand_apart,
     supported_faces,
     view_information,
@@ -246,12 +248,16 @@ def reconstruct_surface(
     )
     fit = first_fit(first.views, looking, first.gsd, known=first.known, tolerances=tolerances)
     first = first.opened(given, fit)
-    refined = refine(
-        first.mesh,
+    refined = _near_points(
+        first,
         fit,
-        stands_apart=partial(stand_apart, least=MIN_EXPLAINED),
-        walls=first.walls,
-        on_progress=on_progress,
+        partial(
+            refine,
+            first.mesh,
+            stands_apart=partial(stand_apart, least=MIN_EXPLAINED),
+            walls=first.walls,
+        ),
+        on_progress,
     )
     _warn_of_inconsistent(looking.angle_model, first.views, refined)
     if not len(refined.mesh.faces):
@@ -417,6 +423,32 @@ def consistent_hull(
         if np.median(least) <= MAX_SHARE:
             break
     return best, float(np.median(least))
+
+
+def _near_points(
+    first: _First, fit: Fit, refined: Callable[..., Refined], on_progress: OnProgress
+) -> Refined:
+    """A refined surface; where many sparse points are off it, one that is pulled from farther.
+
+    A part whose edges no outline shows may lie several edges beside its points, whose loss is then
+    flat. A wider loss lets wrong points pull as well.
+    """
+    found = refined(fit, on_progress=on_progress)
+    off = None if first.hull is None else share_off(found.mesh, first.known, first.views)
+    # Where the phases are biased (OPA), points only dent the surface: that is `_free_of_points`.
+    if off is None or off <= MAX_OFF or _free_of_points(first, found) is not None:
+        return found
+    terms = replace(fit.tol.terms, point_loss_edges=1.0)
+    again = refined(replace(fit, tol=replace(fit.tol, terms=terms)))
+    still_off = share_off(again.mesh, first.known, first.views)
+    if still_off is None or still_off >= off:
+        return found
+    logger.info(
+        "%.0f %% of the sparse points were off the surface; pulled from farther, %.0f %%.",
+        100 * off,
+        100 * still_off,
+    )
+    return replace(again, fit=replace(again.fit, tol=fit.tol))
 
 
 def _warn_of_inconsistent(

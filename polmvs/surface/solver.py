@@ -94,12 +94,16 @@ class Level:
     num_steps : largest number of Gauss-Newton iterations.
     loss_scale : of the phase rows' loss, in their standard deviations.
     gate_px : outlines farther from a silhouette than this are not pulled to it.
+    is_uncrossed : make a mesh anew whose sheets have crossed, so that parts join and separate. Each
+        new mesh rounds creases and thin walls, which only a coarse level's successors make good.
+        Measured on a chair, remade at all levels and at the first: F at 1 mm of 73 and 93 %.
     """
 
     edge_px: float
     num_steps: int
     loss_scale: float
     gate_px: float
+    is_uncrossed: bool = False
 
     @property
     def width_px(self) -> float:
@@ -132,7 +136,7 @@ class SolverTolerances:
     """
 
     levels: tuple[Level, ...] = (
-        Level(edge_px=10.0, num_steps=12, loss_scale=12.0, gate_px=25.0),
+        Level(edge_px=10.0, num_steps=24, loss_scale=12.0, gate_px=25.0, is_uncrossed=True),
         Level(edge_px=5.0, num_steps=12, loss_scale=8.0, gate_px=8.0),
         Level(edge_px=3.0, num_steps=8, loss_scale=6.0, gate_px=4.0),
         Level(edge_px=2.0, num_steps=3, loss_scale=4.0, gate_px=4.0),
@@ -342,10 +346,12 @@ def _refined_at(
     moved, energy, is_thin = np.zeros(len(mesh.vertices)), None, False
     first, last = tol.annealing
     for step in range(level.num_steps):
-        # A mesh that has moved far is irregular. In one that intersects itself views see the
-        # inside. Other meshes stay as they are, because the grid rounds their creases.
+        # A mesh that has moved far is irregular. Other meshes stay as they are, because the grid
+        # rounds their creases.
         scene = RayScene(mesh)
-        if step > 0 and not is_thin and _is_irregular(scene, moved, edge, tol):
+        is_far = float(np.quantile(np.abs(moved), 0.98)) > tol.remesh_after * edge
+        has_crossed = level.is_uncrossed and len(scene.crossed_faces(CROSSED_DEPTH * edge)) > 0
+        if step > 0 and not is_thin and (is_far or has_crossed):
             # No smoothing: the mesh is smooth. The grid loses walls thinner than its cells.
             again = RayScene(remeshed(scene, edge, smoothing=0))
             is_thin = _loses_walls(scene, again, fit.views)
@@ -402,12 +408,6 @@ def _at_level(
 def _loses_walls(scene: RayScene, again: RayScene, views: Sequence[SurfaceView]) -> bool:
     """Whether a remeshed surface covers clearly less of the silhouettes than the one before."""
     return covered_share(scene, views) - covered_share(again, views) >= REMESHING_LOSS
-
-
-def _is_irregular(scene: RayScene, moved: Array, edge: float, tol: SolverTolerances) -> bool:
-    """Whether a mesh has moved (V,) far since it was made, or intersects itself."""
-    is_far = float(np.quantile(np.abs(moved), 0.98)) > tol.remesh_after * edge
-    return is_far or len(scene.crossed_faces(CROSSED_DEPTH * edge)) > 0
 
 
 @dataclass(frozen=True)

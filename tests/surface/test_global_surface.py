@@ -125,6 +125,38 @@ def test_sparse_points_correct_the_bias_of_phases_where_they_are(maps, surface):
     assert np.median(beyond) > np.median(within)
 
 
+def lid_height(radius):
+    """A lid that is round, so that it is no planar patch, below the rim at 0.5."""
+    return 0.2 + 0.15 * (1 - (radius / 0.8) ** 2)
+
+
+def sunk_lid(p):
+    """A cylinder of radius 1 with the lid in its top."""
+    radius = np.hypot(p[..., 0], p[..., 1])
+    outside = np.maximum(radius - 1, np.abs(p[..., 2]) - 0.5)
+    return 0.7 * np.maximum(outside, -np.maximum(radius - 0.8, lid_height(radius) - p[..., 2]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_points", [0, 60])
+def test_a_lid_that_no_outline_shows_lies_on_its_sparse_points(num_points):
+    """Neither phases nor silhouettes give its height: only the points know it."""
+    views = seen_in(phase_maps_of(sunk_lid, ring_of_views(12, elevations=(30.0, 55.0))))
+    rng = np.random.default_rng(0)
+    angle, radius = 2 * np.pi * rng.random(num_points), 0.7 * np.sqrt(rng.random(num_points))
+    height = lid_height(radius) + rng.normal(0, 0.2 * GSD, num_points)
+    points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
+    normals = np.column_stack([0.3 / 0.64 * points[:, :2], np.ones(num_points)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    seeds = Seeds(points, normals, np.full(num_points, 0.3 * GSD))
+    found = reconstruct_surface(LOOKING, views, SparsePoints(seeds, NOTHING.surroundings))
+    vertices = found.mesh.vertices
+    radius = np.hypot(*vertices.T[:2])
+    lid = (radius < 0.6) & (vertices[:, 2] > 0)
+    error_px = np.median(np.abs(vertices[lid, 2] - lid_height(radius[lid]))) / GSD
+    assert error_px < 0.5 if num_points else error_px > 4
+
+
 def test_what_no_view_sees_is_left_out(surface):
     """All cameras look down: the lowest part of the ball faces none of them."""
     heights = surface.mesh.centers[:, 2]

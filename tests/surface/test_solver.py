@@ -573,9 +573,15 @@ def test_a_shoulder_on_which_views_agree_becomes_a_ledge():
     assert error @ true.face_areas / true.face_areas.sum() < 0.8 * GSD
 
 
-@pytest.mark.parametrize(("crossed", "num_meshes"), [(0, 1), (1, 8)])
-def test_a_mesh_whose_sheets_have_crossed_is_made_anew(ball, monkeypatch, crossed, num_meshes):
+@pytest.mark.parametrize(
+    ("crossed", "is_uncrossed", "num_meshes"), [(0, True, 1), (1, True, 8), (1, False, 1)]
+)
+def test_a_mesh_whose_sheets_have_crossed_is_made_anew(
+    ball, monkeypatch, crossed, is_uncrossed, num_meshes
+):
+    """At a coarse level: at a fine one, creases would be rounded again and again."""
     made = []
+    levels = (replace(QUICK.levels[0], is_uncrossed=is_uncrossed),)
 
     def counted(*args, **kwargs):
         made.append(kwargs)
@@ -583,5 +589,5 @@ def test_a_mesh_whose_sheets_have_crossed_is_made_anew(ball, monkeypatch, crosse
 
     monkeypatch.setattr("polmvs.surface.solver.remeshed", counted)
     monkeypatch.setattr(RayScene, "crossed_faces", lambda self, depth: np.zeros(crossed))
-    refined(visual_hull(ball), ball, tolerances=replace(QUICK, levels=QUICK.levels[:1]))
+    refined(visual_hull(ball), ball, tolerances=replace(QUICK, levels=levels))
     assert len(made) == num_meshes
