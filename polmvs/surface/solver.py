@@ -349,9 +349,7 @@ def _refined_at(
         # A mesh that has moved far is irregular. Other meshes stay as they are, because the grid
         # rounds their creases.
         scene = RayScene(mesh)
-        is_far = float(np.quantile(np.abs(moved), 0.98)) > tol.remesh_after * edge
-        has_crossed = level.is_uncrossed and len(scene.crossed_faces(CROSSED_DEPTH * edge)) > 0
-        if step > 0 and not is_thin and (is_far or has_crossed):
+        if step > 0 and not is_thin and _is_irregular(scene, moved, edge, level, tol):
             # No smoothing: the mesh is smooth. The grid loses walls thinner than its cells.
             again = RayScene(remeshed(scene, edge, smoothing=0))
             is_thin = _loses_walls(scene, again, fit.views)
@@ -408,6 +406,15 @@ def _at_level(
 def _loses_walls(scene: RayScene, again: RayScene, views: Sequence[SurfaceView]) -> bool:
     """Whether a remeshed surface covers clearly less of the silhouettes than the one before."""
     return covered_share(scene, views) - covered_share(again, views) >= REMESHING_LOSS
+
+
+def _is_irregular(
+    scene: RayScene, moved: Array, edge: float, level: Level, tol: SolverTolerances
+) -> bool:
+    """Whether a mesh has moved (V,) far since it was made, or intersects itself and may not."""
+    if float(np.quantile(np.abs(moved), 0.98)) > tol.remesh_after * edge:
+        return True
+    return level.is_uncrossed and len(scene.crossed_faces(CROSSED_DEPTH * edge)) > 0
 
 
 @dataclass(frozen=True)
