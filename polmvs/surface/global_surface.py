@@ -435,7 +435,7 @@ def _near_points(
     """
     found = refined(fit, on_progress=on_progress)
     off = None if first.hull is None else share_off(found.mesh, first.known, first.views)
-    # Where the phases are biased (OPA), points only dent the surface: that is `_free_of_points`.
+    # Points do not correct biased phases (OPA): they only dent the surface.
     if off is None or off <= MAX_OFF or _free_of_points(first, found) is not None:
         return found
     terms = replace(fit.tol.terms, point_loss_edges=1.0)
