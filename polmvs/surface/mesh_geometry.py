@@ -472,7 +472,9 @@ def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
     return mesh
 
 
-def thickened(scene: RayScene, coarse: RayScene, edge: float) -> TriangleMesh:
+def thickened(
+    scene: RayScene, coarse: RayScene, edge: float, *, kept_within: float = 1.0
+) -> TriangleMesh:
     """The mesh of a scene, widened on both sides where a coarse mesh of it lost thin parts.
 
     These and what lies within two edges of them, to which they are joined, become two edges thick.
@@ -482,15 +484,16 @@ def thickened(scene: RayScene, coarse: RayScene, edge: float) -> TriangleMesh:
     Parameters
     ----------
     scene : of a closed mesh.
-    coarse : of the same surface, with edges of length ``edge``. A vertex farther from it than an
-        edge is lost. The rounded sides of a plate lie nearer.
+    coarse : of the same surface, with edges of length ``edge``.
+    kept_within : a vertex farther from the coarse mesh, in edges, is lost. The rounded sides of a
+        plate lie within 1 edge, its surfaces within 0.5.
     """
     mesh = scene.mesh
     if not len(mesh.faces):
         return mesh
     is_lost = np.ones(len(mesh.vertices), np.bool_)
     if len(coarse.mesh.faces):
-        is_lost = coarse.distance(mesh.vertices) > edge
+        is_lost = coarse.distance(mesh.vertices) > kept_within * edge
     if not is_lost.any():
         return mesh
     is_near = cKDTree(mesh.vertices[is_lost]).query(mesh.vertices)[0] <= 2 * edge

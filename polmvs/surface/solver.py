@@ -400,7 +400,11 @@ def _at_level(
     if not _loses_walls(scene, again, views):
         return again.mesh
     logger.info("parts that edges of the level would lose are widened.")
-    return remeshed(RayScene(thickened(scene, again, edge)), edge)
+    wide = RayScene(remeshed(RayScene(thickened(scene, again, edge)), edge))
+    if not _loses_walls(scene, wide, views):
+        return wide.mesh
+    # The rounded rim of a thin wall is lost as well.
+    return remeshed(RayScene(thickened(scene, again, edge, kept_within=0.5)), edge)
 
 
 def _loses_walls(scene: RayScene, again: RayScene, views: Sequence[SurfaceView]) -> bool:
