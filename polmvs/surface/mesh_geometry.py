@@ -159,6 +159,17 @@ class TriangleMesh:
         """Vertices displaced by ``(V, 3)``."""
         return TriangleMesh(self.vertices + displacement, self.faces)
 
+    def halved(self) -> TriangleMesh:
+        """Each face cut into four at the middles of its edges; the inner ones are the last."""
+        num = len(self.vertices)
+        ends = np.sort(np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=-1), axis=-1)
+        edges, index = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+        middles = num + index.reshape(-1, 3)  # of the edges that begin at the three corners
+        at_corners = np.stack([self.faces, middles, np.roll(middles, 1, axis=1)], axis=-1)
+        faces = np.concatenate([at_corners.reshape(-1, 3), middles])
+        vertices = np.concatenate([self.vertices, self.vertices[edges].mean(axis=1)])
+        return TriangleMesh(vertices, faces)
+
     def only(self, kept: Mask) -> TriangleMesh:
         """The ``kept`` (F,) faces and the vertices that they use."""
         faces = self.faces[kept]
@@ -472,9 +483,7 @@ def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
     return mesh
 
 
-def thickened(
-    scene: RayScene, coarse: RayScene, edge: float, *, kept_within: float = 1.0
-) -> TriangleMesh:
+def thickened(scene: RayScene, coarse: RayScene, edge: float) -> TriangleMesh:
     """The mesh of a scene, widened on both sides where a coarse mesh of it lost thin parts.
 
     These and what lies within two edges of them, to which they are joined, become two edges thick.
@@ -484,16 +493,15 @@ def thickened(
     Parameters
     ----------
     scene : of a closed mesh.
-    coarse : of the same surface, with edges of length ``edge``.
-    kept_within : a vertex farther from the coarse mesh, in edges, is lost. The rounded sides of a
-        plate lie within 1 edge, its surfaces within 0.5.
+    coarse : of the same surface, with edges of length ``edge``. A vertex farther from it than an
+        edge is lost. The rounded sides of a plate lie nearer.
     """
     mesh = scene.mesh
     if not len(mesh.faces):
         return mesh
     is_lost = np.ones(len(mesh.vertices), np.bool_)
     if len(coarse.mesh.faces):
-        is_lost = coarse.distance(mesh.vertices) > kept_within * edge
+        is_lost = coarse.distance(mesh.vertices) > edge
     if not is_lost.any():
         return mesh
     is_near = cKDTree(mesh.vertices[is_lost]).query(mesh.vertices)[0] <= 2 * edge

@@ -22,6 +22,7 @@ from polmvs.camera import in_image, sample_image
 from polmvs.fitting import like_most, robust_deviation
 from polmvs.geometry import dots, lengths, unit
 from polmvs.normals.estimator import solve_normals
+from polmvs.polarization.region import grow_mask
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS
 from polmvs.surface.creases import CreaseTolerances, SideAverage
 from polmvs.surface.dense_view import lattice_xy
@@ -680,7 +681,7 @@ def share_off(
     for view in views:
         xy = view.view.project(known.points)
         shown = view.silhouette.certain | view.silhouette.possible
-        shown = ndimage.binary_dilation(shown, iterations=2)  # a point of the outline is inside
+        shown = grow_mask(shown, 2)  # a point of the outline is inside
         if view.view.name in outside:
             shown &= ~outside[view.view.name]
         num_seen += in_image(view.view.camera, xy)

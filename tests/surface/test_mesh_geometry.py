@@ -69,6 +69,19 @@ def test_a_thin_plate_that_is_kept_is_not_widened():
     assert (np.linalg.norm(moved[sides], axis=1) > 0.03).all()
 
 
+def test_cut_triangles_are_the_same_surface_with_half_the_edges():
+    mesh = extracted(torus())
+    cut = mesh.halved()
+    assert euler_number(cut) == 0
+    assert len(cut.faces) == 4 * len(mesh.faces)
+    assert cut.mean_edge == pytest.approx(0.5 * mesh.mean_edge)
+    np.testing.assert_array_equal(cut.vertices[: len(mesh.vertices)], mesh.vertices)
+    assert cut.face_areas.sum() == pytest.approx(mesh.face_areas.sum())
+    of_corners = np.repeat(mesh.face_normals, 3, axis=0)
+    normals = np.concatenate([of_corners, mesh.face_normals])
+    np.testing.assert_allclose(cut.face_normals, normals, atol=1e-9)
+
+
 def test_extraction_of_nothing_is_empty():
     mesh = mesh_from_grid(np.ones((4, 4, 4), np.float32), np.zeros(3), 1.0)
     assert len(mesh.vertices) == len(mesh.faces) == 0
