@@ -293,7 +293,7 @@ def refine(
         edge = level.edge_px * fit.gsd
         edge *= max(float(np.sqrt(_num_vertices(mesh, edge) / tol.max_vertices)), 1.0)
         fit = fit.at_width(level.width_px)
-        mesh = _at_level(RayScene(mesh), edge, fit.views, walls, is_first=number == 0)
+        mesh = _at_level(RayScene(mesh), edge, fit.views, walls)
         mesh, fit = _refined_at(mesh, fit, level, edge, (done, total), on_progress)
         done += level.num_steps
         meshes.append(mesh)
@@ -393,28 +393,24 @@ def _refined_at(
 
 
 def _at_level(
-    scene: RayScene,
-    edge: float,
-    views: Sequence[SurfaceView],
-    walls: SignedDistance | None,
-    *,
-    is_first: bool,
+    scene: RayScene, edge: float, views: Sequence[SurfaceView], walls: SignedDistance | None
 ) -> TriangleMesh:
     """A level's first mesh.
 
-    Parts that a new one would lose are widened; outlines make them thin again. If widening brings
-    silhouettes back, walls are thin, and later levels cut the triangles of the one before.
+    Parts that a new mesh would lose are widened; outlines make them thin again. If widening brings
+    silhouettes back, the walls are thin: then the triangles of a mesh that is no finer than the
+    level are kept and cut.
     """
+    mesh, ratio = scene.mesh, np.sqrt(2)  # half of the factor of two by which a cut is finer
     again = RayScene(remeshed(scene, edge, solid=() if walls is None else (walls,)))
     if not _loses_walls(scene, again, views):
         return again.mesh
     wide = RayScene(remeshed(RayScene(thickened(scene, again, edge)), edge))
-    if is_first or not _loses_walls(wide, again, views):
+    if ratio * mesh.mean_edge < edge or not _loses_walls(wide, again, views):
         logger.info("parts that edges of the level would lose are widened.")
         return wide.mesh
     logger.info("the triangles are cut: a new mesh would lose thin walls.")
-    mesh = scene.mesh
-    while mesh.mean_edge > np.sqrt(2) * edge:
+    while mesh.mean_edge > ratio * edge:
         mesh = mesh.halved()
     return mesh
 
